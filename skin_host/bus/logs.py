@@ -10,8 +10,10 @@ python-can one by one, so that the result does not depend on how a line was read
 only for them and for the other formats: that takes longer than ten seconds of a board's frames.
 """
 
+import codecs
 import contextlib
 import io
+import logging
 import re
 from bisect import bisect_left
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -23,10 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.wire import FrameBatch, RecordBatch
-from skin_host.errors import LogError
+from skin_host.errors import LogError, visible
 
 if TYPE_CHECKING:
     import can
+
+log = logging.getLogger(__name__)
 
 #: One batch holds at most this many frames.
 CAPACITY = 1024
@@ -39,6 +43,9 @@ BLOCK_BYTES = 1 << 19
 MOST_CHANNELS = 1000
 #: Longer lines are damage.
 _LONGEST_LINE = 1 << 16
+#: So many characters of a damaged one are shown.
+_SHOWN = 60
+_WANTED = "plain text as of `candump -L`, such as (1700000000.000125) can0 4E4#40F4F4"
 #: Lines of this length and more are decoded one by one.
 _LONGEST_ALIKE = 100
 #: For lines of one length, this many forms are decoded together; others one by one.
@@ -69,6 +76,10 @@ Convert = Callable[["can.Message"], tuple[str, Frame] | None]
 
 class DamageError(Exception):
     """A line that is not a message, or a file that cannot be read further."""
+
+
+class UnfinishedError(DamageError):
+    """A last line that was not written whole, as by a power cut."""
 
 
 _TOO_MANY = DamageError(f"more than {MOST_CHANNELS} channels")
@@ -103,6 +114,7 @@ def read_blocks(file: BinaryIO, convert: Convert) -> Generator[Block, None, None
     read = getattr(file, "read1", file.read)
     names: dict[str, int] = {}
     rest = b""
+    number = 1
     while True:
         try:
             text = read(BLOCK_BYTES)
@@ -110,14 +122,17 @@ def read_blocks(file: BinaryIO, convert: Convert) -> Generator[Block, None, None
             yield block_of([], names, 0, error)
             return
         lines = rest + text
+        if number == 1:
+            lines = lines.removeprefix(codecs.BOM_UTF8)
         whole = lines.rfind(b"\n") + 1
         if text and len(lines) - whole <= _LONGEST_LINE:
             lines, rest = lines[:whole], lines[whole:]
         else:
             rest = b""
         if lines:
-            block = _parse(lines, names, convert)
+            block = _parse(lines, names, convert, number, is_end=not text)
             yield block
+            number += lines.count(b"\n")
             if block.damage is not None:
                 return
         if not text:
@@ -178,7 +193,12 @@ class _Rows(NamedTuple):
 _EMPTY, _FRAME, _NO_FRAME = 1, 2, 3
 
 
-def _parse(text: bytes, names: dict[str, int], convert: Convert) -> Block:
+def _parse(
+    text: bytes, names: dict[str, int], convert: Convert, number: int, *, is_end: bool
+) -> Block:
+    """Decode lines, of which the first has this number; at the end of a file the last one may be
+    unfinished.
+    """
     known = len(names)
     buffer = np.frombuffer(text, np.uint8)
     ends = np.flatnonzero(buffer == _NEWLINE)
@@ -209,8 +229,10 @@ def _parse(text: bytes, names: dict[str, int], convert: Convert) -> Block:
     for row in np.flatnonzero(rows.kind == 0).tolist():
         try:
             _decode_one(text[starts[row] : ends[row]], row, rows, names, convert)
-        except Exception as error:  # python-can has many kinds of errors for a damaged line
-            damage = error
+        except DamageError as error:
+            is_unfinished = is_end and row == n - 1 and not text.endswith(b"\n")
+            kind = UnfinishedError if is_unfinished else DamageError
+            damage = kind(f"line {number + row}: {error}")
             rows.kind[row:] = _EMPTY
             break
     of_frames = np.flatnonzero(rows.kind == _FRAME)
@@ -285,19 +307,33 @@ def _numbers(digits: NDArray[np.uint8], n: int) -> NDArray[np.int64]:
 def _decode_one(
     line: bytes, row: int, rows: _Rows, names: dict[str, int], convert: Convert
 ) -> None:
+    """Decode a line into its row.
+
+    Raises:
+        DamageError: it is none of candump, or is not to be believed.
+    """
     import can
 
-    from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG
+    from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, one_line
 
     rows.kind[row] = _EMPTY
+    seen = line
     error = _ERROR_LINE.match(line)
     if error is not None:
         line = b"%b%d%b" % (error[1], int(error[2]) - 2, line[error.end() :])
-    for message in can.CanutilsLogReader(io.StringIO(line.decode(), newline=None)):
+    try:
+        messages = list(can.CanutilsLogReader(io.StringIO(line.decode(), newline=None)))
+    except Exception:  # python-can has many kinds of errors for a damaged line
+        shown = visible(seen.decode(errors="replace"), _SHOWN)
+        raise DamageError(f'seen "{shown}", wanted {_WANTED}') from None
+    for message in messages:
         if rows.kind[row] != _EMPTY:
             raise DamageError("several messages in one line")
         rows.kind[row] = _NO_FRAME
-        converted = convert(message)
+        try:
+            converted = convert(message)
+        except ValueError as refused:
+            raise DamageError(one_line(refused)) from None
         if converted is None:
             continue
         name, (identifier, data, t_ns) = converted
@@ -311,8 +347,24 @@ def _decode_one(
         rows.t_ns[row] = t_ns
 
 
+def channel_names(path: Path) -> Iterator[str]:
+    """Yield each channel of a recording when its first frame comes; "" is one without a name.
+
+    Damage ends them: `read_channels` reports it.
+
+    Raises:
+        LogError: the recording is absent, or of unknown format.
+    """
+    seen: set[str] = set()
+    with contextlib.closing(_blocks(path)) as blocks:
+        for block in blocks:
+            new = [block.names[code] for code in dict.fromkeys(block.channel.tolist())]
+            yield from (name for name in new if name not in seen)
+            seen.update(new)
+
+
 def read_channels(
-    path: Path, window_ns: int = WINDOW_NS, *, merged: bool = False
+    path: Path, window_ns: int = WINDOW_NS, only: str | None = None
 ) -> Iterator[tuple[str, FrameBatch]]:
     """Yield channel and frames of a recording at full speed, in batches as from a live bus.
 
@@ -323,7 +375,7 @@ def read_channels(
     Args:
         path: file; its suffix gives the format.
         window_ns: a batch spans at most this time.
-        merged: take the frames of all channels for those of one, in the recording's order.
+        only: return the frames of this channel alone, in the recording's order.
 
     Raises:
         LogError: absent, of unknown format, empty, or damaged; everything before the damage has
@@ -336,8 +388,11 @@ def read_channels(
     with contextlib.closing(_blocks(path)) as blocks:
         for block in blocks:
             n += block.messages
-            batch = block.batch
-            channel = np.zeros_like(block.channel) if merged else block.channel
+            batch, channel = block.batch, block.channel
+            if only is not None and block.names != [only]:
+                code = block.names.index(only) if only in block.names else len(block.names)
+                of_only = np.flatnonzero(channel == code)
+                batch, channel = batch[of_only], channel[of_only]
             if rest is not None and len(rest):
                 batch, channel = rest.joined(batch), np.concatenate((rest_channel, channel))
             begin = 0
@@ -351,6 +406,10 @@ def read_channels(
             damage = block.damage
             if damage is not None:
                 break
+    if n and isinstance(damage, UnfinishedError):
+        shown = visible(str(path))
+        log.warning("%s: ends in the middle of a line; read as far as it is whole", shown)
+        damage = None
     if damage is not None:
         from skin_host.bus.port import one_line
 
@@ -480,7 +539,7 @@ def _reader(path: Path) -> "can.io.generic.MessageReader":
     if not issubclass(kind, can.io.generic.TextIOMessageReader):
         return can.LogReader(path)
     file = gzip.open(path) if zipped else path.open("rb")  # noqa: SIM115  # the reader closes it
-    lines = _Lines(cast(BinaryIO, file), errors="strict")
+    lines = _Lines(cast(BinaryIO, file), encoding="utf-8-sig", errors="strict")
     return DatedAscReader(lines) if kind is can.ASCReader else kind(lines)
 
 

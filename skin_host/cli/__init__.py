@@ -33,7 +33,7 @@ from skin_host.daemon import service
 from skin_host.errors import SkinError, nearest, visible
 
 if TYPE_CHECKING:
-    from _typeshed import SupportsWrite
+    from _typeshed import ReadableBuffer, SupportsWrite
 
 #: Of more choices only the probable one is named.
 MANY = 8
@@ -88,6 +88,17 @@ def _complain(line: str) -> None:
     print(line, file=sys.stderr)
 
 
+class _StandardOutput(io.FileIO):
+    """The raw stream below `sys.stdout`, whose errors name it."""
+
+    def write(self, data: "ReadableBuffer") -> int | None:  # type: ignore[override]
+        try:
+            return super().write(data)
+        except OSError as error:
+            error.filename = error.filename or "standard output"
+            raise
+
+
 def _make_printable() -> None:
     """What is printed where nobody can read it goes nowhere, and never ends a command.
 
@@ -102,6 +113,23 @@ def _make_printable() -> None:
             with contextlib.suppress(OSError):  # a stream that changed under our feet
                 stream.reconfigure(errors=stderr.SPELT)
     stderr.replace()
+    _name_output()
+
+
+def _name_output() -> None:
+    """Make `sys.stdout` a stream over `_StandardOutput`, unless it is another program's."""
+    own = sys.__stdout__
+    if own is None or sys.stdout is not own or not isinstance(own, io.TextIOWrapper):
+        return
+    own.flush()
+    raw = _StandardOutput(own.fileno(), "w", closefd=False)
+    sys.stdout = io.TextIOWrapper(
+        raw if own.write_through else io.BufferedWriter(raw),
+        encoding=own.encoding,
+        errors=own.errors,
+        line_buffering=own.line_buffering,
+        write_through=own.write_through,
+    )
 
 
 def _reader_left() -> bool:

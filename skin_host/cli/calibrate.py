@@ -63,12 +63,14 @@ def add_commands(commands: Commands) -> None:
         "--seconds",
         type=positive,
         default=5.0,
-        help="how long to look; at least 60 readings of each pad are taken",
+        help="how long to look; longer until each board that sends gave 60 readings of each pad",
     )
     calibrate.add_argument("--output", type=Path, metavar="FILE", help="keep it here instead")
     calibrate.add_argument("--json", action="store_true", help="one JSON document")
     calibrate.add_argument(
-        "--strict", action="store_true", help="exit status 1 if the skin was touched meanwhile"
+        "--strict",
+        action="store_true",
+        help="exit status 1 if the skin was touched meanwhile, or received too rarely",
     )
     _add_fits(calibrate)
     add_rules(
@@ -135,9 +137,12 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 
     from skin_host.client.serving import served_by_daemon
     from skin_host.daemon.calibrate import take_calibration
-    from skin_host.daemon.memory import remembered
+    from skin_host.daemon.memory import known_of, remembered
+    from skin_host.daemon.state import Zeros
     from skin_host.layout import parts_of
-    from skin_host.processing.calibration.file import with_gains_of
+    from skin_host.processing.calibration import with_pressures_of, with_zeros
+    from skin_host.processing.calibration.calibrator import going_on
+    from skin_host.processing.calibration.file import find_calibration
     from skin_host.processing.calibration.outcome import outcome
 
     set_up_logging(arguments.verbose)
@@ -158,23 +163,26 @@ def _calibrate(arguments: argparse.Namespace) -> int:
             "calibrating beside it "
             "would zero its boards; ask it with `skin command calibrate`, or stop it"
         )
-    touched: dict[str, list[int]] = {}
+    zeros = Zeros()
     with suppress(OtherSkinError):
-        touched = remembered(settings, layout, arguments.node).zeros.touched
+        zeros = remembered(settings, layout, arguments.node).zeros
     progress = Progress("calibrating, keep the skin untouched")
     try:
         found = asyncio.run(
             take_calibration(
-                settings, layout, parts, arguments.seconds, progress.update, touched=touched
+                settings, layout, parts, arguments.seconds, progress.update, touched=zeros.touched
             )
         )
     finally:
         progress.close()
-    if path.is_file():
-        found = with_gains_of(found, path, layout)
+    before = find_calibration(path, layout, found.configuration)
+    if before is not None:
+        found = going_on(found, known_of(before, zeros, layout))
+        found = with_zeros(found, before.zeros | found.zeros)
+        found = with_pressures_of(found, before)
     _keep(arguments, path, found, layout)
     tips = [name for name, tip in settings.fingertips.items() if tip.node == arguments.node]
-    result = outcome(found, layout, parts, fingertips=tips)
+    result = outcome(found, layout, parts, fingertips=tips, before=before)
     return show(result, {"file": str(path), **result}, f"kept in {path}", arguments)
 
 
@@ -192,7 +200,7 @@ def show(
     Returns:
         The exit status.
     """
-    from skin_host.daemon.calibrate import touched_meanwhile
+    from skin_host.daemon.calibrate import received_too_rarely, touched_meanwhile
     from skin_host.health.diagnosis import named_by_part
 
     if arguments.json:
@@ -204,12 +212,18 @@ def show(
         is_one = sum(map(len, found["unchanged"].values())) == 1
         go_on = "it goes on" if is_one else "they go on"
         warn(f"{named_by_part(found['unchanged'])}: received too rarely; {go_on} as before")
+    rare = received_too_rarely(found)
+    if rare:
+        warn(
+            f"{named_by_part(rare)}: received too rarely; not valid until calibrated; check with "
+            "`skin scan` whether their boards are powered and answer"
+        )
     if found["damaged"]:
         warn(f"{named_by_part(found['damaged'])}: calibrated without the bytes that were damaged")
     touched = touched_meanwhile(found, "repeat")
     if touched is not None:
         warn(touched)
-    return 1 if touched and arguments.strict else 0
+    return 1 if arguments.strict and (touched or rare or found["unchanged"]) else 0
 
 
 def _calibration_path(arguments: argparse.Namespace, settings: "Settings") -> Path:
@@ -398,6 +412,7 @@ def _show_course(
                 "lag_s": curves.lag_s,
                 "highest_kpa": curves.highest_kpa,
                 "ratio_to_curve": fitted.ratio,
+                "hysteresis_known": fitted.unloads,
                 "memory": {
                     "radius_kpa": list(curves.memory.radius_kpa),
                     "weight": list(curves.memory.weight),
@@ -428,10 +443,11 @@ def _show_course(
     )
     print(f"0 to {curves.highest_kpa:.0f} kPa; the table's clock is {curves.lag_s:+.2f} s ahead")
     print(f"{fitted.ratio:.2g} times the pressures of the configured curve")
-    print(f"hysteresis of the foam: {plays or 'none'}")
+    print(f"hysteresis of the foam: {plays or ('none' if fitted.unloads else 'not known')}")
     print(", ".join(f"{count} {name}" for name, count in counts.items() if count))
     if len(error):
-        print(f"expected error of the good: median {middle:.1f} kPa, 95 % below {worst:.1f} kPa")
+        of = "the good" if fitted.unloads else "the good while loading"
+        print(f"expected error of {of}: median {middle:.1f} kPa, 95 % below {worst:.1f} kPa")
     for part, taxels in verdicts.items():
         for name, numbers in taxels.items():
             if name not in ("good", "unknown") and numbers:
@@ -449,7 +465,7 @@ def _kept(
 ) -> dict[str, list[int]]:
     """Return by part the pressure taxels that keep what was known of them.
 
-    Warns of them, and of pressures that may be in another unit.
+    Warns of them, of pressures that may be in another unit, and of a course that does not unload.
     """
     from skin_host.health.diagnosis import named_by_part
     from skin_host.processing.calibration import by_part
@@ -457,6 +473,11 @@ def _kept(
 
     if fitted.ratio > DOUBTFUL_RATIO:
         warn(f"{log}: {describe_ratio(fitted.ratio)}")
+    if not fitted.unloads:
+        warn(
+            f"{log}: the pressure does not go down again for a tenth of the time: the foam's "
+            "hysteresis is not known, and pressures that go down read too high"
+        )
 
     if before is None:
         what = "they have neither gains nor curves of their own"
@@ -469,7 +490,12 @@ def _kept(
     ):
         if found := by_part(taxels, layout):
             warn(f"{named_by_part(found)}: {why}; {what}")
-    return by_part(unpressed, layout)
+    if found := by_part(fitted.unshown, layout):
+        warn(
+            f"{named_by_part(found)}: moved too little in {log} to show a curve; they keep the one "
+            "that they have"
+        )
+    return by_part(unpressed | fitted.unshown, layout)
 
 
 def curve_verdicts(curves: "Curves", layout: "Layout") -> dict[str, dict[str, list[int]]]:

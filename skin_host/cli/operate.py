@@ -114,7 +114,9 @@ def add_commands(commands: Commands) -> None:
     command.add_argument("--reset", action="store_true", help="thresholds: as configured")
     command.add_argument("--json", action="store_true", help="one JSON document")
     command.add_argument(
-        "--strict", action="store_true", help="calibrate: exit status 1 if the skin was touched"
+        "--strict",
+        action="store_true",
+        help="calibrate: exit status 1 if the skin was touched, or received too rarely",
     )
     add_rules(
         command,

@@ -174,10 +174,8 @@ async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, A
     from skin_host.client import SkinClient
 
     async with SkinClient(broker, robot=robot, patience_s=PATIENCE_S) as skin:
-        nodes = await skin.info()
-        parts = {
-            part: name for name, node in nodes.items() for part in [*node.parts, *node.fingertips]
-        }
+        await skin.info()
+        parts = {part: described.node for part, described in skin.parts().items()}
         live: dict[str, dict[str, Any]] = {}
         stored: dict[str, dict[str, Any]] = {}
 

@@ -31,7 +31,7 @@ from skin_host.cli.common import (
 )
 from skin_host.cli.options import add_rules
 from skin_host.daemon import service
-from skin_host.errors import ConfigurationError, RequestError, visible
+from skin_host.errors import ConfigurationError, RequestError, required, visible
 
 if TYPE_CHECKING:
     import can
@@ -162,7 +162,11 @@ def _add_measurements(commands: Commands) -> None:
         metavar="DIR",
         help="folder of recordings of real skin (.npz); ../shared/data/insole if it is there",
     )
-    report.add_argument("--quick", action="store_true", help="within a minute")
+    report.add_argument(
+        "--quick",
+        action="store_true",
+        help="less certain: short histories, of foams to which no model was fitted, and few trials",
+    )
     report.add_argument("--output", type=Path, metavar="DIR", help="folder for page and plots")
     report.add_argument("--json", action="store_true", help="one JSON document")
     add_rules(report, idle_with={"--recordings": ["--contacts", "--rig"]})
@@ -435,6 +439,8 @@ def _report(arguments: argparse.Namespace) -> int:
     output = arguments.output
     if output is None and not arguments.json and not arguments.real:
         output = Path("report")
+    if output is not None:
+        required("matplotlib", "pictures", "plots")  # before the work, which takes minutes
     on_recordings = {"recordings": arguments.recordings} if name in ("real", "report") else {}
     try:
         document = module.run(quick=arguments.quick, output=output, **on_recordings)

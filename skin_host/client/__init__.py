@@ -11,14 +11,14 @@ lost meanwhile. `SkinCallbacks` is the same without asyncio. All that they raise
 """
 
 from skin_host.client.callbacks import SkinCallbacks
-from skin_host.client.heard import Health
+from skin_host.client.heard import Described, Health
 from skin_host.client.presence import Contact
 from skin_host.client.session import CommandError, Node, SkinClient, WrongCommandError
 from skin_host.client.streams import Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.info import NodeInfo, PartInfo
+from skin_host.mqtt.info import FingertipInfo, NodeInfo, PartInfo
 from skin_host.mqtt.messages import Frame
 from skin_host.processing.events import Touch
 
@@ -27,6 +27,8 @@ __all__ = [
     "BrokerError",
     "CommandError",
     "Contact",
+    "Described",
+    "FingertipInfo",
     "Frame",
     "Health",
     "Node",

@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from functools import partial
 from typing import Any, Literal, Self, TypeVar
 
-from skin_host.client.heard import Health
+from skin_host.client.heard import Described, Health
 from skin_host.client.presence import Contact
 from skin_host.client.session import SkinClient
 from skin_host.client.streams import Stream
@@ -32,8 +32,8 @@ class SkinCallbacks:
 
     The functions run one after the other in one thread, which is not the caller's: data that they
     share with it needs a lock, and while one of them runs nothing else is received. An exception in
-    one of them is logged, and the next ones are called. In them `present` can be asked, and nothing
-    that waits: `ready`, `info`, `command` and `on_...` raise a RequestError there.
+    one of them is logged, and the next ones are called. In them `present` and `parts` can be asked,
+    and nothing that waits: `ready`, `info`, `command` and `on_...` raise a RequestError there.
 
     Raises (on entering): see `SkinClient`.
     Raises (in use):
@@ -103,17 +103,20 @@ class SkinCallbacks:
         self._on(lambda skin: skin.contacts(part), call_unknown)
 
     def present(self, part: str | None = None) -> list[Touch]:
-        if threading.current_thread() is self._thread:
-            return self._skin.present(part)
-
-        async def found(skin: SkinClient) -> list[Touch]:
-            return skin.present(part)
-
-        return self._wait_for(found)
+        """See `SkinClient.present`."""
+        return self._ask(lambda skin: skin.present(part))
 
     def on_health(self, call: Callable[[Health], object], part: str | None = None) -> None:
         """Call with each record of a part's health, or of all parts' health."""
         self._on(lambda skin: skin.health(part), call)
+
+    def on_info(self, call: Callable[[Described], object], part: str | None = None) -> None:
+        """Call with the description of a part, or of all, and with each that follows."""
+        self._on(lambda skin: skin.infos(part), call)
+
+    def parts(self) -> dict[str, Described]:
+        """See `SkinClient.parts`."""
+        return self._ask(SkinClient.parts)
 
     def ready(self) -> None:
         """Wait until what follows reaches the functions: the broker knows what they ask for."""
@@ -123,8 +126,14 @@ class SkinCallbacks:
         return self._wait_for(lambda skin: skin.info(timeout_s))
 
     def command(
-        self, name: str, *, node: str | None = None, timeout_s: float = 10.0, **arguments: Any
+        self,
+        name: str,
+        *,
+        node: str | None = None,
+        timeout_s: float | None = None,
+        **arguments: Any,
     ) -> dict[str, Any]:
+        """See `SkinClient.command`."""
         return self._wait_for(
             lambda skin: skin.command(name, node=node, timeout_s=timeout_s, **arguments)
         )
@@ -177,6 +186,16 @@ class SkinCallbacks:
                 call(item)
             except BaseException:  # SystemExit would end the thread, and what the others receive
                 _log.exception("a callback failed")
+
+    def _ask(self, question: Callable[[SkinClient], T]) -> T:
+        """Ask for what the client knows; that can be asked in a callback, too."""
+        if threading.current_thread() is self._thread:
+            return question(self._skin)
+
+        async def found(skin: SkinClient) -> T:
+            return question(skin)
+
+        return self._wait_for(found)
 
     def _wait_for(self, work: Callable[[SkinClient], Coroutine[Any, Any, T]]) -> T:
         if threading.current_thread() is self._thread:

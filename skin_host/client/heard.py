@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 from skin_host.client.presence import Contact
 from skin_host.fingertip.events import Over, Slip
+from skin_host.mqtt.info import FingertipInfo, PartInfo
 from skin_host.mqtt.messages import EVENT_DECODERS, Frame, decode_contact, decode_health
 from skin_host.mqtt.order import Stamp
 from skin_host.mqtt.payload import MessageError
@@ -38,6 +39,29 @@ class Health(NamedTuple):
     @property
     def sentences(self) -> list[str]:
         return self.record.get("sentences", [])
+
+
+class Described(NamedTuple):
+    """A part or fingertip, as the node describes it that has it now.
+
+    A part may have moved from one node to another, which both name it: it is that of the node that
+    is online, and of several the one whose info is the newest. In a stream `info` is None, and
+    `node` empty, when no node names the part any more.
+    """
+
+    part: str
+    node: str
+    info: PartInfo | FingertipInfo | None
+
+    @property
+    def skin(self) -> PartInfo | None:
+        """Where its taxels are, if it is a part of skin."""
+        return self.info if isinstance(self.info, PartInfo) else None
+
+    @property
+    def fingertip(self) -> FingertipInfo | None:
+        """Its shape, if it is a fingertip on a force/torque board."""
+        return self.info if isinstance(self.info, FingertipInfo) else None
 
 
 def is_online(payload: bytes, stamp: Stamp | None, *, is_only_broker: bool) -> bool | None:

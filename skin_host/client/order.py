@@ -76,6 +76,11 @@ class EventOrder:
         #: By part: the greatest run and number, and since when only smaller ones came.
         self._frames: dict[str, tuple[tuple[int, int], float | None]] = {}
 
+    def run_of(self, event: Event) -> int | None:
+        """Return the run that is followed of an event's part and kind; None: there is none yet."""
+        known = self._known.get((type(event), event.part))
+        return None if known is None else known.chain.run
+
     def take_frame(self, frame: Frame, run: int | None, now_s: float) -> bool:
         """Return whether a frame is newer than all before; older frames are not waited for."""
         if run is None:

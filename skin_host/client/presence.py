@@ -1,5 +1,5 @@
-"""Contact state of the parts and status of the nodes, and whether they are still known. Pure: takes
-times.
+"""Contact state of the parts, status of the nodes, and which node has a part, and whether they are
+still known. Pure: takes times.
 
 Fails safe: a part whose node is offline or silent, or whose broker is lost, is UNKNOWN, whatever
 was received from it last. So is a part whose messages come much later than before: a broker that
@@ -8,11 +8,13 @@ a node of which no part is received in time.
 """
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Literal, NamedTuple
 
 from skin_host.mqtt.messages import ContactState
+from skin_host.mqtt.order import Stamp
 from skin_host.processing.events import Touch
 
 #: Why a contact state is unknown: the node cannot feel all of the part; the node, or only this
@@ -42,6 +44,9 @@ class Contact(NamedTuple):
 #: are forgotten.
 MAX_TOUCHES = 1000
 MAX_TOUCHED = 200_000
+#: Of nodes that name the same part: the one that is online has it, rather than one that may be.
+_RANKS: dict[bool | None, int] = {False: 0, None: 1, True: 2}
+_NO_STAMP = Stamp(-1, -1)
 #: A distance between two clocks is the least one that was seen for this long, or twice as long.
 DISTANCE_S = 120.0
 
@@ -63,7 +68,8 @@ class Lateness:
 
     Its clock and ours are not the same. What can be seen is that the distance between the two times
     grows: it is compared with the least of the last `DISTANCE_S` to twice that. So a clock that was
-    set back looks late for this long, and no longer.
+    set back looks late for this long, and no longer. The stamps of one connection follow a clock
+    that is never set: such a step shows with the next one, see `_Part`.
     """
 
     def __init__(self) -> None:
@@ -90,6 +96,8 @@ class _Part:
     #: Since when it is waited for what was not stored.
     waiting_s: float = -math.inf
     lateness: Lateness = field(default_factory=Lateness)
+    #: Of the node, over which the last message came whose time is known.
+    connection: int | None = None
     #: How late the last message was whose time is known.
     late_s: float = 0.0
     #: Brokers from which the state, or its deletion, came; without any it is out of date.
@@ -99,13 +107,26 @@ class _Part:
     run: int | None = None
     touches: dict[int, tuple[Touch, float]] = field(default_factory=dict)
 
-    def hear(self, now_s: float, sent_s: float | None, stale_s: float) -> None:
+    def hear(
+        self,
+        now_s: float,
+        stale_s: float,
+        sent_s: float | None = None,
+        connection: int | None = None,
+    ) -> None:
         """Take a sign of life: it shows that the part lived when it was sent.
 
         A stale part comes back with a message that is half as late as one that makes it stale, so
         that it does not flap where messages come about as late as that.
+
+        The node's clock may have been set before its next connection: the distance to ours is
+        another then. Not if what came before was late: a broker that is held up sends the messages
+        of the next connection after those of the last one, and as late.
         """
         if sent_s is not None:
+            if connection != self.connection and self.late_s <= stale_s / 2:
+                self.lateness = Lateness()
+            self.connection = connection
             self.late_s = self.lateness.of(sent_s, now_s)
         if now_s - self.alive_s <= stale_s or self.late_s <= stale_s / 2:
             if self.alive_s == -math.inf and self.received == "OFF":
@@ -119,12 +140,26 @@ class _Part:
 
 @dataclass(slots=True)
 class _Node:
-    #: By its newest status; None: that is not known any more.
-    online: bool | None
+    #: Whether it is online by its newest status; None: that does not show it.
+    status: bool | None
     #: Brokers from which that came.
     over: set[int]
     #: Of which it publishes, by its status, as far as that has room for them.
     parts: frozenset[str]
+
+    @property
+    def online(self) -> bool | None:
+        """Whether it is online; None: that is not known any more."""
+        return self.status if self.over else None
+
+
+class _Info(NamedTuple):
+    """The parts that a node's info names, and which of two infos is newer."""
+
+    parts: list[str]
+    #: None: it has none, and the one that was received later counts as newer.
+    stamp: Stamp | None
+    number: int
 
 
 class Presence:
@@ -137,8 +172,11 @@ class Presence:
     def __init__(self, stale_s: float) -> None:
         self._stale_s = stale_s
         self._parts: dict[str, _Part] = {}
-        self._parts_of: dict[str, list[str]] = {}
+        #: By node.
+        self._infos: dict[str, _Info] = {}
+        #: By part, see `holders`.
         self._node_of: dict[str, str] = {}
+        self._numbers = count()
         self._nodes: dict[str, _Node] = {}
 
     def take_state(
@@ -151,6 +189,7 @@ class Presence:
         again: bool = False,
         stored: bool = False,
         sent_s: float | None = None,
+        connection: int | None = None,
     ) -> None:
         """Take the newest contact state; None: it was deleted.
 
@@ -162,28 +201,31 @@ class Presence:
             again: it came from another broker before.
             stored: the broker had it; it does not show that the part lives.
             sent_s: when it was sent, by the node's clock. None: not known, or it was stored.
+            connection: of the node, over which it was sent.
         """
         known = self._parts.setdefault(part, _Part())
         known.received = state
         known.over = known.over | {broker} if again else {broker}
         if not stored and state is not None:
-            known.hear(now_s, sent_s, self._stale_s)
+            known.hear(now_s, self._stale_s, sent_s, connection)
             if state == "OFF":
                 known.touches.clear()
         elif known.alive_s == -math.inf:
             known.waiting_s = now_s
 
-    def take_sign(self, part: str, now_s: float, sent_s: float | None = None) -> None:
+    def take_sign(
+        self, part: str, now_s: float, sent_s: float | None = None, connection: int | None = None
+    ) -> None:
         """Take any other message of a part that was not a retained one."""
         if part in self._parts:
-            self._parts[part].hear(now_s, sent_s, self._stale_s)
+            self._parts[part].hear(now_s, self._stale_s, sent_s, connection)
 
     def take_touch(self, touch: Touch, now_s: float, run: int | None = None) -> None:
         """Take a touch, of a run of the node if that is known; those of the runs before have ended
         with them.
         """
         part = self._parts.setdefault(touch.part, _Part())
-        part.hear(now_s, None, self._stale_s)
+        part.hear(now_s, self._stale_s)
         if run is not None and run != part.run:
             part.touches.clear()
             part.run = run
@@ -218,17 +260,57 @@ class Presence:
         """
         before = self._nodes.get(node)
         over = before.over if again and before is not None else set()
+        self._nodes[node] = _Node(online, over | {broker}, frozenset(parts))
+        if before is None or before.status != online:
+            self._find_holders(now_s)
         if online and before is not None and not before.online:
             for name, part in self._parts.items():
                 if self._node_of.get(name) == node:
                     part.wait(now_s)
-        self._nodes[node] = _Node(online, over | {broker}, frozenset(parts))
 
-    def take_info(self, node: str, parts: Iterable[str]) -> None:
+    def take_info(
+        self, node: str, parts: Iterable[str], now_s: float, stamp: Stamp | None = None
+    ) -> None:
+        """Take the newest info of a node: which parts it names, and its stamp, if it has one."""
         # Only what the last info of each node names: whoever may publish could go on for ever.
-        self._parts_of.pop(node, None)
-        self._parts_of[node] = list(parts)
-        self._node_of = {part: name for name, known in self._parts_of.items() for part in known}
+        self._infos[node] = _Info(list(parts), stamp, next(self._numbers))
+        self._find_holders(now_s)
+
+    def forget_info(self, node: str, now_s: float) -> None:
+        """Note that the info of a node was deleted."""
+        if self._infos.pop(node, None) is not None:
+            self._find_holders(now_s)
+
+    def forget_node(self, node: str, now_s: float) -> None:
+        """Note that all that is retained of a node was deleted: there is no such node."""
+        self._nodes.pop(node, None)
+        self.forget_info(node, now_s)
+
+    @property
+    def holders(self) -> Mapping[str, str]:
+        """By part: the node that has it now.
+
+        A part may have moved from one node to another, and what is retained of the former one names
+        it still. So it is that of the node that is online, then of one that may be, and of several
+        of these the one whose info is the newest.
+        """
+        return self._node_of
+
+    def _find_holders(self, now_s: float) -> None:
+        def rank(node: str) -> tuple[int, Stamp, int]:
+            known, info = self._nodes.get(node), self._infos[node]
+            # Until it has another one its status is that before the loss of a broker.
+            status = None if known is None else known.status
+            return _RANKS[status], info.stamp or _NO_STAMP, info.number
+
+        before = self._node_of
+        self._node_of = {
+            part: node for node in sorted(self._infos, key=rank) for part in self._infos[node].parts
+        }
+        for name, part in self._parts.items():
+            former = before.get(name)
+            if former is not None and self._node_of.get(name) not in (None, former):
+                part.wait(now_s)  # what is known of it is of the former node
 
     def take_refusal(self, part: str, broker: int = 0) -> None:
         """Note that a broker does not let us receive the state of a part any more."""
@@ -244,12 +326,26 @@ class Presence:
                 part.received, part.alive_s = None, -math.inf
         for node in self._nodes.values():
             node.over.discard(broker)
-            if not node.over:
-                node.online = None
 
-    def forget(self, part: str) -> None:
-        """Forget a part that is not followed any more."""
-        self._parts.pop(part, None)
+    def forget_state(self, part: str) -> None:
+        """Forget the contact state of a part, which is not followed any more."""
+        known = self._parts.get(part)
+        if known is not None:
+            known.received = known.reported = None
+            known.over.clear()
+            self._forget_unfollowed(part)
+
+    def forget_touches(self, part: str) -> None:
+        """Forget the touches of a part, which are not followed any more."""
+        known = self._parts.get(part)
+        if known is not None:
+            known.touches.clear()
+            self._forget_unfollowed(part)
+
+    def _forget_unfollowed(self, part: str) -> None:
+        known = self._parts[part]
+        if not (known.touches or known.over or known.reported):
+            del self._parts[part]
 
     def online(self, node: str, now_s: float) -> bool | None:
         """Return whether a node is online; None: not known.
@@ -274,10 +370,11 @@ class Presence:
         knows with which configuration the robot will start.
         """
         nodes = self._nodes.values()
-        complete = self._nodes.keys() <= self._parts_of.keys()
+        complete = self._nodes.keys() <= self._infos.keys()
         if not complete or not any(node.online for node in nodes):
             return None
-        return set().union(*self._parts_of.values(), *(node.parts for node in nodes))
+        named = [info.parts for info in self._infos.values()]
+        return set().union(*named, *(node.parts for node in nodes))
 
     def brokers(self, node: str) -> set[int]:
         """Return the brokers from which the newest status of a node came."""
@@ -310,17 +407,28 @@ class Presence:
     def touches(self, part: str | None, now_s: float) -> list[Touch]:
         """What touches a part, or all, as far as it is known.
 
-        A touch whose end was lost goes when it has not moved for `stale_s` while its part was
-        received: a touch that lasts moves once a second.
+        Nothing is known of a part that is not received: its node is offline, or it may be, or the
+        part is silent or received too late. A touch whose end was lost goes when it has not moved
+        for `stale_s` while its part was received: a touch that lasts moves once a second.
         """
         found = []
         for name, known in self._parts.items():
+            if not self._is_received(name, now_s):
+                continue
             for number, (touch, at_s) in list(known.touches.items()):
                 if min(known.alive_s, now_s) - at_s > self._stale_s:
                     del known.touches[number]
                 elif part in (None, name):
                     found.append(touch)
         return found
+
+    def _is_received(self, part: str, now_s: float) -> bool:
+        """Return whether what is known of a part is from now, as far as that shows."""
+        state = self.contact(part, now_s)
+        if state is not None:
+            return state.why in (None, "not_felt")
+        node = self._nodes.get(self._node_of.get(part, ""))
+        return (node is None or node.online is True) and self._parts[part].alive_s > -math.inf
 
     def reported(self) -> list[Contact]:
         """The contact states as they were reported last."""

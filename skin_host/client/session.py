@@ -6,17 +6,18 @@ import itertools
 import logging
 import math
 import secrets
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
-from skin_host.client.heard import Health, is_online, read
+from skin_host.client.absent import no_such_part, unpublished
+from skin_host.client.heard import Described, Health, is_online, read
 from skin_host.client.links import RETAINED_S, ROBOT_S, BrokerLink, only_robot, refusal
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Contact, Presence
-from skin_host.client.streams import Stream, refuse_other_loop
+from skin_host.client.streams import Kind, Stream, refuse_other_loop
 from skin_host.errors import BrokerError, RequestError, SkinError, visible
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
@@ -30,7 +31,7 @@ from skin_host.mqtt.connection import (
 )
 from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
 from skin_host.mqtt.messages import Frame
-from skin_host.mqtt.order import parts_of, run_of, stamp_of
+from skin_host.mqtt.order import Stamp, parts_of, run_of, stamp_of
 from skin_host.mqtt.payload import JSON_TYPE, MessageError
 from skin_host.mqtt.topics import NAME, PartTopic, Topics, wrong_part
 from skin_host.processing.events import Touch
@@ -46,8 +47,12 @@ MAX_INFO_BYTES = 32 * 1024 * 1024
 #: Daemons find a broker that starts, or that comes back, within 3 s. This long after the last of
 #: them has named its parts there are no others.
 NAMED_S = 5.0
-#: Of more parts only so many are named.
-MOST_NAMED = 20
+#: No more reasons why messages are unreadable are logged.
+MOST_REASONS = 20
+#: A node answers a command within this time, and that for which the command lasts.
+ANSWER_S = 10.0
+#: Health comes once a second, and may come late: nothing could be called stale sooner.
+LEAST_STALE_S = 1.5
 #: Timeouts are checked this often.
 WATCH_S = 0.25
 
@@ -55,10 +60,12 @@ T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 
-def needed(kind: PartTopic) -> tuple[PartTopic, ...]:
-    """Return the topics that a stream of a kind needs: a contact state is valid only while its part
-    lives.
+def needed(kind: Kind) -> tuple[PartTopic, ...]:
+    """Return the topics of parts that a stream of a kind needs: a contact state is valid only while
+    its part lives. Those of the nodes are always subscribed to.
     """
+    if kind == "info":
+        return ()
     return ("contact", "health", "touch") if kind == "contact" else (kind,)
 
 
@@ -90,6 +97,8 @@ class Node:
 
     online: bool | None = None
     info: NodeInfo | None = None
+    #: Whether the broker has its status.
+    has_status: bool = field(default=False, repr=False)
     #: Pieces of its info, by number.
     pieces: dict[int, NodeInfo] = field(default_factory=dict, repr=False)
     #: Their lengths as messages, in bytes.
@@ -108,18 +117,19 @@ class SkinClient:
         protocol: of MQTT, for a broker given by URL.
         patience_s: how long entering waits for a broker that cannot be reached.
         stale_s: a part that was not received for this long, or only so late, is UNKNOWN to
-            `contacts`.
+            `contacts`; `LEAST_STALE_S` or more.
 
     Attributes:
         nodes: the robot's daemons by name, as far as they have been received.
         connections: how often a broker was found; more than the number of brokers means that one
             was lost.
         last_error: why one was lost, or not found.
-        unreadable: messages whose payload did not fit their topic.
+        unreadable: messages whose payload did not fit their topic, or needs a package that is not
+            installed.
 
     Raises (on making it):
-        RequestError: the URL is wrong, a time is negative or no number, or several brokers are
-            named without the robot.
+        RequestError: the URL is wrong, a time is negative or no number, `stale_s` is too short, or
+            several brokers are named without the robot.
 
     Raises (on entering):
         BrokerError: no broker, or one that refuses us.
@@ -136,6 +146,7 @@ class SkinClient:
             later still is received by who reads on. Or nothing of this kind comes of the part: of a
             fingertip on a force/torque board no frames, nor of a part whose configuration has
             `frames = false`; of a part of skin no slips and no excesses.
+        SkinError: the frames of the part are in CBOR, and cbor2 is not installed.
     """
 
     def __init__(
@@ -158,6 +169,11 @@ class SkinClient:
             brokers.append(found)
         _check_several(brokers, robot)
         _check_times(patience_s=patience_s, stale_s=stale_s)
+        if stale_s < LEAST_STALE_S:
+            raise RequestError(
+                f"stale_s: seen {stale_s}, wanted {LEAST_STALE_S} s or more: health comes once a "
+                "second, and a part is not known in between otherwise"
+            )
         self._base = base or "skin"
         self._topics = None if robot is None else Topics(self._base, robot)
         self._robot = robot
@@ -168,6 +184,8 @@ class SkinClient:
         self._asked: dict[str, Result | None] = {}
         self._streams: WeakSet[Stream[Any]] = WeakSet()
         self._latest: dict[str, Health] = {}
+        #: The parts as they were described last, see `infos`.
+        self._described: dict[str, Described] = {}
         #: Names that were received: of parts, and of nodes.
         self._names: tuple[set[str], set[str]] = (set(), set())
         self._info_bytes = 0
@@ -189,6 +207,7 @@ class SkinClient:
         self.nodes: dict[str, Node] = {}
         self.last_error = ""
         self.unreadable = 0
+        self._unreadable_for: set[str] = set()
 
     @property
     def robot(self) -> str:
@@ -237,9 +256,10 @@ class SkinClient:
         return self._stream(part, "contact")
 
     def present(self, part: str | None = None) -> list[Touch]:
-        """Return the last event of each contact that lasts now, as far as known.
+        """Return the last event of each contact that lasts now, as far as known: none of a part
+        whose state is not known because nothing is received of it.
 
-        They are followed while a stream of `contacts` or `touches` exists.
+        They are followed while a stream of `contacts`, `touches` or `events` exists.
 
         Raises:
             RequestError: the robot has no such part.
@@ -255,6 +275,26 @@ class SkinClient:
     def health(self, part: str | None = None) -> Stream[Health]:
         """Health of parts: the last one, see `Health.stored`, and each change."""
         return self._stream(part, "health")
+
+    def infos(self, part: str | None = None) -> Stream[Described]:
+        """Descriptions of a part, or of all: the present one, and each change of it, as after a
+        `reload`, or when the part moves to another node, or no node names it any more.
+        """
+        return self._stream(part, "info")
+
+    def parts(self) -> dict[str, Described]:
+        """Return the parts and fingertips by name, each with its description and the node that has
+        it now, see `Described`.
+
+        As far as they have been received: after `info()` those of all nodes that are online.
+        """
+        found = {}
+        for part, node in self._presence.holders.items():
+            info = self.nodes[node].info if node in self.nodes else None
+            if info is not None:
+                described = info.parts.get(part) or info.fingertips.get(part)
+                found[part] = Described(part, node, described)
+        return found
 
     async def ready(self) -> None:
         """Wait until all subscriptions so far have reached the broker.
@@ -287,6 +327,8 @@ class SkinClient:
                 await self._until(
                     lambda: (
                         self.nodes
+                        # Infos come before the statuses, which show whose parts they are.
+                        and all(node.has_status for node in self.nodes.values())
                         and all(node.info or not node.online for node in self.nodes.values())
                         and any(node.info for node in self.nodes.values())
                     )
@@ -301,14 +343,20 @@ class SkinClient:
         return known
 
     async def command(
-        self, name: str, *, node: str | None = None, timeout_s: float = 10.0, **arguments: Any
+        self,
+        name: str,
+        *,
+        node: str | None = None,
+        timeout_s: float | None = None,
+        **arguments: Any,
     ) -> dict[str, Any]:
         """Send a command to a node and return its result.
 
         Args:
             name: of the command.
             node: which one; by default the robot's only node.
-            timeout_s: how long to wait for the answer.
+            timeout_s: how long to wait for the answer. None: `ANSWER_S`, and of a command that has
+                `seconds` that many more.
             arguments: of the command. The request's `id` is the client's, whatever is given.
 
         Raises:
@@ -323,6 +371,8 @@ class SkinClient:
             raise RequestError(
                 "a command and a node have names of up to 64 of the characters a-z 0-9 _ -"
             )
+        if timeout_s is None:
+            timeout_s = ANSWER_S + _duration_s(arguments)
         _check_times(timeout_s=timeout_s)
         number = f"{self._identifier}-{next(self._numbers)}"
         try:
@@ -342,7 +392,7 @@ class SkinClient:
                 raise CommandError(f"broker {self.where}: {self.last_error}") from None
             raise CommandError(
                 f'no answer to "{name}" from node "{node or "?"}" of robot "{self.robot}" within '
-                f"{timeout_s:g} s; is `skin run` running there?"
+                f"{timeout_s:g} s; it may still be carried out; is `skin run` running there?"
             ) from None
         except MqttError as error:
             raise CommandError(f"broker {self.where}: {explain(error)}") from None
@@ -461,7 +511,7 @@ class SkinClient:
         if wrong is not None:
             raise RequestError(wrong)
 
-    def _stream(self, part: str | None, *kinds: PartTopic) -> Stream[Any]:
+    def _stream(self, part: str | None, *kinds: Kind) -> Stream[Any]:
         self._check_use(part)
         stream: Stream[Any] = Stream(part, *kinds)
         stream.loop = self._loop
@@ -474,6 +524,10 @@ class SkinClient:
             for contact in self._presence.reported():
                 if part in (None, contact.part):
                     stream.put(contact)
+        if "info" in kinds:
+            for described in self._described.values():
+                if part in (None, described.part):
+                    stream.put(described)
         self._ask_again()
         return stream
 
@@ -493,13 +547,7 @@ class SkinClient:
         since_s = max(self._named_s, *(link.since_s for link in self._links))
         if names is None or part in names or now_s - since_s < NAMED_S:
             return None
-        listed = [visible(name, 64) for name in sorted(names)[:MOST_NAMED]]
-        if len(names) > len(listed):
-            listed.append(f"... ({len(names)} in all)")
-        return (
-            f'robot "{self.robot}" has no part "{visible(part, 64)}"; there are: '
-            f"{', '.join(listed) or 'none'}"
-        )
+        return no_such_part(self.robot, part, names)
 
     def _check_parts(self, now_s: float) -> None:
         """Fail the streams of parts that the robot does not have, and never had, and those of what
@@ -509,42 +557,9 @@ class SkinClient:
         for stream in self._streams:
             stream.is_judged |= stream.part in names
             missing = None if stream.is_judged else self._missing(stream.part, now_s)
-            why = missing or self._unpublished(stream)
+            why = missing or unpublished(self.robot, stream.part, stream.kinds, self.parts())
             if why is not None:
                 stream.fail(why)
-
-    def _unpublished(self, stream: Stream[Any]) -> str | None:
-        """Return why a part that is known publishes nothing of what a stream is of; None: it does,
-        or may.
-        """
-        part = stream.part
-        if part is None or not set(stream.kinds) <= {"frame", "slip", "over"}:
-            return None
-        infos = [node.info for node in self.nodes.values() if node.info is not None]
-        skins = [info.parts[part] for info in infos if part in info.parts]
-        tips = {name: tip for info in infos for name, tip in info.fingertips.items()}
-        here = f'robot "{self.robot}", part "{visible(part, 64)}"'
-        if "frame" not in stream.kinds:
-            if not skins or part in tips:
-                return None
-            covered = [name for name, tip in tips.items() if tip.array == part]
-            wanted = " or ".join(f'"{visible(name, 64)}"' for name in covered[:MOST_NAMED])
-            return (
-                f"{here}: skin has no slips and no excesses; wanted a fingertip on a force/torque "
-                f"board{wanted and f', {wanted}'}"
-            )
-        if skins:
-            if any(skin.frames for skin in skins):
-                return None
-            return f"{here}: publishes no frames: its configuration has `frames = false`"
-        if part not in tips:
-            return None
-        array = tips[part].array
-        wanted = "a part of skin" if array is None else f'"{visible(array, 64)}", its skin'
-        return (
-            f"{here}: a fingertip on a force/torque board has no taxels and no frames; wanted "
-            f"{wanted}"
-        )
 
     async def _only_node(self) -> str:
         await self._until(lambda: self.connected)
@@ -588,7 +603,8 @@ class SkinClient:
         kinds = {one for kind in stream.kinds for one in needed(kind)}
         if "contact" in stream.kinds:
             kinds.remove("touch")  # it is of use to `present` alone
-        return set().union(*(self._topics_of(kind, stream.part) for kind in kinds))
+        nodes = self._node_topics() if "info" in stream.kinds else set()
+        return nodes.union(*(self._topics_of(kind, stream.part) for kind in kinds))
 
     def _node_topics(self) -> set[str]:
         """Return the topics of what the nodes are, and whether they are online."""
@@ -654,15 +670,18 @@ class SkinClient:
         assert self._topics is not None
         place = self._topics.parse(topic)
         kind = None if place is None else place.kind
-        if kind not in ("contact", "health"):
+        if kind not in ("contact", "health", "touch"):
             return
         for part in self._names[False]:
             if kind in self._kinds_of(part):
                 continue
+            if kind == "touch":
+                self._presence.forget_touches(part)
+                continue
             if kind == "health":
                 self._latest.pop(part, None)
             else:
-                self._presence.forget(part)
+                self._presence.forget_state(part)
             self._newest.forget(kind, part)
 
     def _kinds_of(self, part: str) -> set[PartTopic]:
@@ -703,16 +722,25 @@ class SkinClient:
                 self._take_status(name, payload, link, message)
             elif kind == "info":
                 if self._newness(kind, f"{name}/{piece}", message) is not False:
-                    self._take_info(name, piece, payload)
+                    self._take_info(name, piece, payload, stamp_of(message.properties))
             elif kind == "answer":
                 self._take_answer(decode_result(payload))
             else:
                 self._take_part(kind, name, payload, link, message)
         except SkinError as error:
-            self.unreadable += 1
-            if self.unreadable == 1:
-                topic, why = visible(message.topic.value), visible(str(error))
-                _log.warning("%s: %s; such messages are passed over", topic, why)
+            self._note_unreadable(message.topic.value, error)
+            if not isinstance(error, MessageError):  # it is we who cannot read it
+                for stream in self._streams:
+                    if kind in stream.kinds and stream.part in (None, name):
+                        stream.refuse(kind, error)
+
+    def _note_unreadable(self, topic: str, error: SkinError) -> None:
+        """Count a message that cannot be read; log each reason once, and no more than some."""
+        self.unreadable += 1
+        why = visible(str(error))
+        if why not in self._unreadable_for and len(self._unreadable_for) < MOST_REASONS:
+            self._unreadable_for.add(why)
+            _log.warning("%s: %s; such messages are passed over", visible(topic), why)
 
     def _admit(self, is_node: bool, name: str) -> None:
         """Remember a name, so that what is known of names stays bounded: anybody may publish.
@@ -750,17 +778,25 @@ class SkinClient:
         now_s, again = _now_s(), newness is None
         self._presence.take_node(name, said, now_s, link.number, again=again, parts=parts)
         self._named_s = now_s
-        self.nodes.setdefault(name, Node())
+        self.nodes.setdefault(name, Node()).has_status = bool(payload)
+        self._forget_if_deleted(name)
+        self._report_infos()
         self._report_contacts()
         self._note_nodes()
         self._news.set()
+
+    def _forget_if_deleted(self, name: str) -> None:
+        """Forget a node of which nothing is retained any more: neither its status nor its info."""
+        if not self.nodes[name].pieces and not self.nodes[name].has_status:
+            del self.nodes[name]
+            self._presence.forget_node(name, _now_s())
 
     def _note_nodes(self) -> None:
         now_s = _now_s()
         for name, node in self.nodes.items():
             node.online = self._presence.online(name, now_s)
 
-    def _take_info(self, name: str, piece: int, payload: bytes) -> None:
+    def _take_info(self, name: str, piece: int, payload: bytes, stamp: Stamp | None) -> None:
         node = self.nodes.setdefault(name, Node())
         self._info_bytes -= node.sizes.pop(piece, 0)
         node.pieces.pop(piece, None)
@@ -772,8 +808,13 @@ class SkinClient:
             self._info_bytes += len(payload)
         node.info = join_pieces(node.pieces)
         if node.info is not None:
-            self._presence.take_info(name, [*node.info.parts, *node.info.fingertips])
+            named = [*node.info.parts, *node.info.fingertips]
+            self._presence.take_info(name, named, _now_s(), stamp)
             self._named_s = _now_s()
+        elif not node.pieces:
+            self._presence.forget_info(name, _now_s())
+            self._forget_if_deleted(name)
+        self._report_infos()
         self._report_contacts()
         self._news.set()
 
@@ -793,13 +834,15 @@ class SkinClient:
         now_s = _now_s()
         if isinstance(item, Touch | Slip | Over):
             run = run_of(message.properties)
+            before = self._order.run_of(item)
             for event in self._order.take(item, run, now_s):
-                # What had to wait for its turn may be of another run.
-                self._pass_on(event, run if event.t_ns == item.t_ns else None)
+                # What had to wait for its turn may be of the run before.
+                self._pass_on(event, run if event.t_ns == item.t_ns else before)
         elif isinstance(item, Frame):
-            if self._order.take_frame(item, run_of(message.properties), now_s):
+            run = run_of(message.properties)
+            if self._order.take_frame(item, run, now_s):
                 self._presence.take_sign(part, now_s)
-                self._put(kind, item)
+                self._put(kind, item, run)
         elif kind == "contact":
             assert item is None or isinstance(item, Contact)
             newness = self._newness(kind, part, message)
@@ -812,6 +855,7 @@ class SkinClient:
                     again=newness is None,
                     stored=message.retain,
                     sent_s=_sent_s(message),
+                    connection=self._connection_of(message),
                 )
         elif self._newness(kind, part, message):
             if item is None:
@@ -819,24 +863,40 @@ class SkinClient:
             else:
                 assert isinstance(item, Health)
                 if not item.stored:
-                    self._presence.take_sign(part, now_s, _sent_s(message))
+                    sent_s, connection = _sent_s(message), self._connection_of(message)
+                    self._presence.take_sign(part, now_s, sent_s, connection)
                 self._latest[part] = item._replace(stored=True)
                 self._put(kind, item)
         self._report_contacts()
 
-    def _pass_on(self, event: Touch | Slip | Over, run: int | None = None) -> None:
+    def _connection_of(self, message: Message) -> int | None:
+        """Return the connection of the node over which a message was sent; None: not known, or it
+        shows nothing.
+
+        Over several brokers the messages of a connection do not come after those of the last one: a
+        broker that is held up may be the next one that the node turned to.
+        """
+        stamp = stamp_of(message.properties)
+        return None if stamp is None or len(self._links) > 1 else stamp.connection
+
+    def _pass_on(self, event: Touch | Slip | Over, run: int | None) -> None:
         kind: PartTopic = "touch"
         if isinstance(event, Touch):
             self._presence.take_touch(event, _now_s(), run)
         else:
             kind = "slip" if isinstance(event, Slip) else "over"
             self._presence.take_sign(event.part, _now_s())
-        self._put(kind, event)
+        self._put(kind, event, run)
 
-    def _put(self, kind: PartTopic, item: Touch | Slip | Over | Frame | Health) -> None:
+    def _put(
+        self,
+        kind: PartTopic,
+        item: Touch | Slip | Over | Frame | Health,
+        run: int | None = None,
+    ) -> None:
         for stream in self._streams:
             if kind in stream.kinds and stream.part in (None, item.part):
-                stream.put(item)
+                stream.put(item, run)
 
     def _report_contacts(self) -> None:
         for contact in self._presence.changes(_now_s()):
@@ -844,12 +904,27 @@ class SkinClient:
                 if "contact" in stream.kinds and stream.part in (None, contact.part):
                     stream.put(contact)
 
+    def _report_infos(self) -> None:
+        now = self.parts()
+        gone = self._described.keys() - self._presence.holders.keys()
+        changed = [one for part, one in now.items() if self._described.get(part) != one]
+        for described in [*(Described(part, "", None) for part in gone), *changed]:
+            if described.info is None:
+                del self._described[described.part]
+            elif described.part in self._described or len(self._described) < MAX_NAMES:
+                self._described[described.part] = described
+            else:
+                continue
+            for stream in self._streams:
+                if "info" in stream.kinds and stream.part in (None, described.part):
+                    stream.put(described)
+
     async def _watch(self) -> None:
         """Detect timeouts."""
         while True:
             await asyncio.sleep(WATCH_S)
             for event in self._order.expire(_now_s()):
-                self._pass_on(event)
+                self._pass_on(event, self._order.run_of(event))
             self._report_contacts()
             self._note_nodes()
             self._check_parts(_now_s())
@@ -873,6 +948,13 @@ def _check_times(**times_s: float) -> None:
     for name, time_s in times_s.items():
         if not time_s >= 0:
             raise RequestError(f"{name}: seen {time_s}, wanted seconds from 0 on")
+
+
+def _duration_s(arguments: Mapping[str, Any]) -> float:
+    """Return how long a command lasts, as far as its arguments show it."""
+    seconds = arguments.get("seconds")
+    lasts = isinstance(seconds, int | float) and 0 < seconds < math.inf
+    return float(seconds) if lasts else 0.0  # type: ignore[arg-type]
 
 
 def _sent_s(message: Message) -> float | None:

@@ -3,7 +3,7 @@
 import asyncio
 from collections import deque
 from collections.abc import AsyncIterator
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, Literal, NamedTuple, TypeVar, cast
 
 from msgspec.structs import replace
 
@@ -14,25 +14,39 @@ from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.topics import PartTopic
 from skin_host.processing.events import Touch
 
+#: Of what a stream may be: messages of a topic, or descriptions of parts.
+Kind = PartTopic | Literal["info"]
 #: How many items a stream holds for a slow reader; then the oldest is dropped. The next event or
-#: frame counts it.
-HELD = {
+#: frame of its part counts it.
+HELD: dict[Kind, int] = {
     "touch": 10_000,
     "slip": 10_000,
     "over": 10_000,
     "frame": 256,
     "contact": 1000,
     "health": 1000,
+    "info": 1000,
 }
 #: A state is true until the next one of its part. There are fewer parts than items held.
-STATES = {"contact", "health"}
+STATES = {"contact", "health", "info"}
 #: Of touches no more than have this many taxels together: whoever may publish could send some of
 #: a hundred thousand each.
 HELD_TAXELS = 5_000_000
 #: An event that the broker got twice comes again within this many events.
 DUPLICATE_SPAN = 64
 
+_Numbered = Touch | Slip | Over | Frame
+_COUNTED = (Touch, Slip, Over, Frame)
+
 T = TypeVar("T")
+
+
+class _Last(NamedTuple):
+    """The last item of a part and kind: the start of the node from which it is, and its number."""
+
+    run: int | None
+    number: int
+    t_ns: int
 
 
 def refuse_other_loop(loop: asyncio.AbstractEventLoop | None) -> None:
@@ -67,7 +81,7 @@ class SentTwice:
     def __init__(self) -> None:
         self._latest: dict[tuple[type, str], deque[tuple[int, int]]] = {}
 
-    def has(self, item: Touch | Slip | Over | Frame) -> bool:
+    def has(self, item: _Numbered) -> bool:
         """Return whether an item is among the last ones of its part and kind, and note it."""
         number = item.seq if isinstance(item, Frame) else item.count
         if not number and not isinstance(item, Frame):
@@ -92,7 +106,7 @@ class Stream(AsyncIterator[T], Generic[T]):
         RequestError: this is not the event loop in which the client was entered.
     """
 
-    def __init__(self, part: str | None, *kinds: PartTopic) -> None:
+    def __init__(self, part: str | None, *kinds: Kind) -> None:
         self.part = part
         self.kinds = kinds
         #: In which the client was entered.
@@ -110,12 +124,24 @@ class Stream(AsyncIterator[T], Generic[T]):
         self._wake = asyncio.Event()
         self._closed = False
         #: By kind and part; each has separate numbers.
-        self._last: dict[tuple[type, str], tuple[int, int]] = {}
+        self._last: dict[tuple[type, str], _Last] = {}
+        #: What the reader was too slow for, until the next item that is read.
+        self._lost: dict[tuple[type, str], int] = {}
         self._repeats = SentTwice()
 
-    def put(self, item: T) -> None:
-        """Add a received item."""
+    def put(self, item: T, run: int | None = None) -> None:
+        """Add a received item, unless it came before.
+
+        Args:
+            item: what was received.
+            run: of the node, in which each kind of events of a part is numbered from 1, and its
+                frames from 0; None: not known.
+        """
         self.is_judged, self._failure = True, None
+        if isinstance(item, _COUNTED):
+            if self._repeats.has(item):
+                return
+            item = cast(T, self._counted(item, run))
         self._items.append(item)
         self._taxels += taxels_of(item)
         if len(self._items) > self._most:
@@ -133,9 +159,17 @@ class Stream(AsyncIterator[T], Generic[T]):
             return
         items: list[Any] = list(self._items)
         newest = {item.part: at for at, item in enumerate(items)}
-        del self._items[next(at for at, item in enumerate(items) if newest[item.part] > at)]
+        # Parts that anybody names, and names no longer, are more than those that there are.
+        del self._items[next((at for at, item in enumerate(items) if newest[item.part] > at), 0)]
 
-    def _drop(self) -> T:
+    def _drop(self) -> None:
+        """Drop the oldest item; the next one of its part and kind counts it."""
+        item = self._pop()
+        if isinstance(item, _COUNTED):
+            kind = type(item), item.part
+            self._lost[kind] = self._lost.get(kind, 0) + 1 + item.missed
+
+    def _pop(self) -> T:
         item = self._items.popleft()
         self._taxels -= taxels_of(item)
         return item
@@ -174,28 +208,42 @@ class Stream(AsyncIterator[T], Generic[T]):
                     raise StopAsyncIteration
                 self._wake.clear()
                 await self._wake.wait()
-            item: Any = self._drop()
-            if not isinstance(item, Touch | Slip | Over | Frame):
-                return cast(T, item)
-            if self._repeats.has(item):
-                continue
-            if isinstance(item, Frame):
-                missed = self._missed(item, item.seq)
-            else:
-                # A publisher that does not count cannot be checked.
-                missed = self._missed(item, item.count) if item.count else 0
-            # Other streams hold the same object, and may have missed fewer.
-            return cast(T, replace(item, missed=missed) if missed else item)
+            return self._take_out()
 
-    def _missed(self, item: Touch | Slip | Over | Frame, number: int) -> int:
+    def _take_out(self) -> T:
+        item: Any = self._pop()
+        lost = self._lost.pop((type(item), item.part), 0) if isinstance(item, _COUNTED) else 0
+        return cast(T, replace(item, missed=item.missed + lost) if lost else item)
+
+    def _counted(self, item: _Numbered, run: int | None) -> _Numbered:
+        """Return an item with the number of those that are missing before it."""
+        is_frame = isinstance(item, Frame)
+        number = item.seq if isinstance(item, Frame) else item.count
+        # A publisher that does not count events cannot be checked.
+        missed = self._missed(item, number, run) if number or is_frame else 0
+        # Other streams hold the same object, and may have missed fewer.
+        return item if missed == item.missed else replace(item, missed=missed)
+
+    def _missed(self, item: _Numbered, number: int, run: int | None) -> int:
         """Return how many numbers are missing before this one."""
         kind = type(item), item.part
+        last = self._last.get(kind)
+        if last is None:
+            self._last[kind] = _Last(run, number, item.t_ns)
+            return 0  # what was before it was not asked for
         # What was lost behind greater numbers that were forged, only the order of all events knows.
-        lost = item.missed if kind in self._last else 0
-        last, last_ns = self._last.get(kind, (number - 1, item.t_ns))
-        if item.t_ns < last_ns and 0 < last - number < DUPLICATE_SPAN:
+        lost = item.missed
+        first = 0 if isinstance(item, Frame) else 1
+        if run is not None and last.run is not None:
+            before = last.number if run == last.run else first - 1
+            # What came before a run that is followed again, nobody knows but the order.
+            missed = lost or (number - before - 1 if run >= last.run else 0)
+        elif item.t_ns < last.t_ns and 0 < last.number - number < DUPLICATE_SPAN:
             # It came late over another broker, or its node was restarted with an earlier clock.
             return lost
-        self._last[kind] = number, item.t_ns
-        # A smaller number at a later time means that the node was restarted.
-        return lost or max(0, number - last - 1)
+        else:
+            # A smaller number at a later time means that the node was restarted.
+            before = last.number if number >= last.number else first - 1
+            missed = lost or number - before - 1
+        self._last[kind] = _Last(run, number, item.t_ns)
+        return max(0, missed)

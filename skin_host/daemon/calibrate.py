@@ -19,7 +19,7 @@ from skin_host.errors import CalibrationError, OtherSkinError, SkinError
 from skin_host.files import refuse_other_robot, set_aside
 from skin_host.health.diagnosis import named_by_part
 from skin_host.layout import Layout
-from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration import Calibration, Verdict, by_part, summary
 from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.calibration.outcome import Outcome
 from skin_host.processing.core import Engine
@@ -57,7 +57,7 @@ async def take_calibration(
 
     Raises:
         BusError: a bus cannot be opened.
-        SkinError: no board sent a sweep, or none with a usable sample.
+        SkinError: no board sent a sweep, or no pad is usable by what was received.
     """
     engine = Engine(settings, layout, parts)
     engine.zeros.expect_touched(taxels_of(layout, touched))
@@ -108,7 +108,7 @@ async def collect(
         clock: for waiting.
 
     Raises:
-        SkinError: no board sent a sweep, or none with a usable sample.
+        SkinError: no board sent a sweep, or no pad is usable by what was received.
     """
     engine().begin_calibration(seconds)
     ledger = engine().ledger
@@ -129,7 +129,34 @@ async def collect(
         came = now.sweeps > (before_sweeps if now is ledger else 0)
         raise SkinError(f"no calibration: {_why_none(engine(), came)}")
     # Of a large skin this takes a second, in which the boards' frames must be read.
-    return await clock.in_thread(compute)
+    found = await clock.in_thread(compute)
+    if not by_part(found.usable, engine().layout):
+        raise SkinError(f"no calibration: {_why_unusable(found, engine(), falls)}")
+    return found
+
+
+def _why_unusable(found: Calibration, engine: Engine, falls: int) -> str:
+    """Return in words why no pad is usable by a calibration.
+
+    Args:
+        found: the calibration.
+        engine: that has collected it.
+        falls: how often boards were zeroed meanwhile.
+    """
+    verdicts = summary(found, engine.layout)
+    names = [engine.layout.parts[part].name for part in engine.parts]
+    counted = {
+        name: [f"{number} {word.replace('_', ' ')}" for word, number in verdicts[name].items()]
+        for name in names
+    }
+    listed = "; ".join(f"{name}: {', '.join(counts)}" for name, counts in counted.items() if counts)
+    why = f"no pad is usable by what was received: {listed}"
+    if falls:
+        why += (
+            f"; boards were zeroed {falls} times meanwhile, as by a restart: check with "
+            "`skin scan` whether they keep their power"
+        )
+    return why
 
 
 def _why_none(engine: Engine, came: NDArray[np.bool_]) -> str:
@@ -182,6 +209,17 @@ def touched_meanwhile(found: Outcome, repeat: str) -> str | None:
         f"the skin was touched while it was calibrated: {touched}; take away what touches it and "
         f"{repeat}: these read too little until then"
     )
+
+
+def received_too_rarely(found: Outcome) -> dict[str, list[int]]:
+    """Return by part the numbers of the taxels that have no zero, as too little came of them."""
+    rare: dict[str, list[int]] = {}
+    for triangle in found["triangles"]:
+        for verdict in (Verdict.TOO_FEW, Verdict.ABSENT):
+            numbers = triangle["taxels"].get(verdict.name.lower(), [])
+            if numbers:
+                rare.setdefault(triangle["part"], []).extend(numbers)
+    return rare
 
 
 def calibration_path(settings: Settings, node: str) -> Path:

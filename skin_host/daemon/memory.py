@@ -19,11 +19,12 @@ import numpy as np
 from skin_host.config.settings import Settings
 from skin_host.daemon import service
 from skin_host.daemon.calibrate import stored_calibration
-from skin_host.daemon.state import NodeState, Zeros, is_there, kept_path, load_kept
+from skin_host.daemon.state import NodeState, Zeros, is_there, kept_path, load_kept, taxels_of
 from skin_host.errors import OtherRobotError, OtherSkinError
 from skin_host.files import write_document
 from skin_host.layout import Layout, PadKind, PartLayout, parts_of
 from skin_host.processing.calibration import Calibration, Verdict, Zero, identified, with_curves
+from skin_host.processing.calibration.calibrator import Known
 from skin_host.processing.calibration.file import save_calibration
 
 log = logging.getLogger(__name__)
@@ -153,6 +154,21 @@ def remembered_with(
     """
     found = [_files(settings, node, calibration)]
     return _Memories(settings, layout, node, node, found).joined()
+
+
+def known_of(calibration: Calibration, zeros: Zeros, layout: Layout) -> Known:
+    """Return what is known of a skin by a kept calibration and what has become of its zeros.
+
+    The zeros of taxels that were touched when a daemon ended are in doubt: the set-up of their
+    board has taken what touched them into its zero.
+    """
+    baseline = calibration.baseline.copy()
+    for part in layout.parts:
+        kept = zeros.baselines.get(part.name, ()) if zeros.are_of(calibration.id) else ()
+        if len(kept) == part.n_taxels:
+            baseline[part.start : part.stop] = kept
+    doubted = taxels_of(layout, zeros.unknown) | taxels_of(layout, zeros.touched)
+    return Known(calibration, baseline, ~doubted)
 
 
 def _found(

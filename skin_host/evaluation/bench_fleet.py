@@ -255,7 +255,7 @@ class _Received:
     status: list[tuple[float, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.presence.take_info(NODE, [PART])
+        self.presence.take_info(NODE, [PART], time.monotonic())
 
     def note(self) -> None:
         """Store what a client would show."""

@@ -32,6 +32,7 @@ from skin_host.processing.core import Engine
 from skin_host.recording.fitting import Samples, fit_curves
 from skin_host.recording.load_table import LoadTable
 from skin_host.recording.replay import calibrate_from_log, steps
+from skin_host.recording.turns import fed
 
 Row = dict[str, Any]
 Floats = NDArray[np.float64]
@@ -52,6 +53,14 @@ LOWEST_LIVE = 100
 VALID_SHARE = 0.5
 LEVELS_KPA = (60.0, 40.0)
 WITHIN_S = 1.0
+#: The load is gone when the pressure stays within this of rest: the skin's resolution by its paper,
+#: which is below the threshold of every pad.
+GONE_KPA = 5.0
+#: What is touched for so long afterwards is not the foam that comes back late, but stays.
+AFTERWARDS_S = 10.0
+#: An error of the pressure that every usable pad must detect: it shows a press where none is, or
+#: hides one.
+FAR_KPA = LEVELS_KPA[0]
 #: The pressure's own record has electrical spikes of one sample: a median over so many.
 SPIKE_SAMPLES = 5
 #: How far sweeps and pressures may be apart where one lag is fitted to a whole file.
@@ -294,6 +303,7 @@ def fit_pressures(path: Path) -> Calibration:
         calibration.verdict < Verdict.ABSENT,
         calibration.usable,
         calibration,
+        ZERO_S,
     )
     n = min(len(recording.t_ns), len(recording.pressure_kpa))
     time_s: Floats = recording.t_ns[:n].astype(np.float64) * 1e-9
@@ -319,8 +329,8 @@ def play(
     engine = Engine(settings, layout, [0], calibration)
     pads = insole.pads(layout)
     t_ns, pressure, touched, valid, begun = [], [], [], [], []
-    outputs = [engine.feed(insole.BUS, batch) for batch in recording.batches()]
-    for step in [step for output in [*outputs, engine.flush()] for step in output.steps]:
+    batches = ((insole.BUS, batch) for batch in recording.batches())
+    for step in [step for _, output in fed(batches, engine, 0) for step in output.steps]:
         t_ns.append(step.frame.t_ns)
         pressure.append(step.frame.pressure_kpa[pads])
         touched.append(step.frame.touched[pads])
@@ -360,18 +370,33 @@ def touches(recording: InsoleRecording, course: PlayedCourse, live: Mask, usable
         "false_begins_per_s": begun / UNTOUCHED_S,
         "pad_begins_10s": int(np.count_nonzero(begun_pads[1:] & ~begun_pads[:-1])),
         "begins_per_pad": float(np.count_nonzero(begins) / n) if n else None,
+        "pads_touched_afterwards": touched_afterwards(recording, course, usable),
     }
     for level in LEVELS_KPA:
         row[f"detected_{level:g}kpa"] = detected(recording, course, usable, level)
     return row
 
 
+def touched_afterwards(
+    recording: InsoleRecording, course: PlayedCourse, usable: Mask
+) -> int | None:
+    """Usable pads that are still touched `AFTERWARDS_S` after the load is gone; None if it never is
+    for so long.
+    """
+    pressure, rest = _course(recording)
+    pressed = np.flatnonzero(pressure > rest + GONE_KPA)
+    if not len(pressed):
+        return None
+    at_ns = recording.t_ns[pressed[-1]] + AFTERWARDS_S * 1e9
+    after = course.t_ns >= at_ns
+    return int(np.count_nonzero(course.touched[after][0, usable])) if after.any() else None
+
+
 def detected(
     recording: InsoleRecording, course: PlayedCourse, usable: Mask, over_kpa: float
 ) -> float | None:
     """Share of usable pads that are reported touched within a second of a lasting pressure."""
-    pressure = _without_spikes(recording.pressure_kpa)[: len(recording.t_ns)]
-    rest = float(np.median(pressure[recording.t_ns[: len(pressure)] - recording.t_ns[0] <= 5e9]))
+    pressure, rest = _course(recording)
     loading = pressure[: int(np.argmax(pressure)) + 1]
     if loading[-1] < rest + over_kpa or not usable.any():
         return None
@@ -391,6 +416,8 @@ def pressure_errors(
             "median_rmse_kpa",
             "p95_rmse_kpa",
             "skin_rms_kpa",
+            "worst_rmse_kpa",
+            "far_share",
             "valid_share",
             "lag_s",
             "lagged_median_rmse_kpa",
@@ -419,9 +446,13 @@ def pressure_errors(
     def of_mean(lag: int) -> float:
         return float(np.sqrt(np.mean((mean_kpa - true_kpa(lag)[known]) ** 2)))
 
-    def errors(lag: int) -> tuple[float, float, float]:
+    def of_each(lag: int) -> Floats:
         squares = (kpa - true_kpa(lag)[:, np.newaxis]) ** 2
-        each = np.sqrt(np.sum(squares, axis=0, where=valid)[count > 0] / count[count > 0])
+        each: Floats = np.sum(squares, axis=0, where=valid)[count > 0] / count[count > 0]
+        return np.sqrt(each)
+
+    def errors(lag: int) -> tuple[float, float, float]:
+        each = of_each(lag)
         return float(np.median(each)), float(np.percentile(each, 95.0)), of_mean(lag)
 
     furthest = round(LARGEST_LAG_S / period_s)
@@ -430,6 +461,9 @@ def pressure_errors(
     row |= dict(zip(names, errors(0), strict=True))
     row |= {f"lagged_{name}": value for name, value in zip(names, errors(lag), strict=True)}
     row["lag_s"] = lag * period_s
+    row["worst_rmse_kpa"] = float(of_each(0).max())
+    far = np.abs(kpa - true_kpa(0)[:, np.newaxis]) > FAR_KPA
+    row["far_share"] = float(np.mean(far[valid]))
     here = valid.any(axis=0)
     row["hindsight"] = errors_in_hindsight(
         kpa[known][:, here], valid[known][:, here], true_kpa(0)[known]
@@ -437,6 +471,13 @@ def pressure_errors(
     at_zero = np.searchsorted(recording.t_ns, recording.t_ns[0] + round(ZERO_S * 1e9))
     row["zero_kpa"] = float(np.median(recording.pressure_kpa[:at_zero]))
     return row
+
+
+def _course(recording: InsoleRecording) -> tuple[Floats, float]:
+    """The pressure at the sweeps, and its value at rest."""
+    pressure = _without_spikes(recording.pressure_kpa)[: len(recording.t_ns)]
+    at_rest = recording.t_ns[: len(pressure)] - recording.t_ns[0] <= ZERO_S * 1e9
+    return pressure, float(np.median(pressure[at_rest]))
 
 
 def _without_spikes(values: Floats) -> Floats:

@@ -31,7 +31,8 @@ IN_COMMON = {"law": "its law", "cause": "a cause", "none": "nothing"}
 def real(document: Report) -> Table:
     """What was measured on recordings of real skin, and below it what others reach."""
     head = ["recording", "live", "usable", "false begins in 10 s", "at 60 kPa", "at 40 kPa"]
-    head += ["begins a pad", "median kPa", "95 % kPa", "mean of the skin kPa", "valid"]
+    head += ["begins a pad", "touched 10 s after", "median kPa", "95 % kPa", "mean of the skin kPa"]
+    head += ["worst pad kPa", "off by 60 kPa", "valid"]
     head += ["lag s", "with it: median", "95 %", "mean"]
     rows = [
         [
@@ -42,7 +43,10 @@ def real(document: Report) -> Table:
             _number(row["detected_60kpa"], "{:.1%}"),
             _number(row["detected_40kpa"], "{:.1%}"),
             _number(row["begins_per_pad"], "{:.2f}"),
+            _number(row["pads_touched_afterwards"], "{:d}"),
             *(_number(row[name], "{:.1f}") for name in ERRORS_KPA),
+            _number(row["worst_rmse_kpa"], "{:.1f}"),
+            _number(row["far_share"], "{:.2%}"),
             _number(row["valid_share"], "{:.1%}"),
             _number(row["lag_s"], "{:.2f}"),
             *(_number(row[f"lagged_{name}"], "{:.1f}") for name in ERRORS_KPA),

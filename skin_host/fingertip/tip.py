@@ -437,6 +437,7 @@ class Tip:
             force_n=normal_n,
             sigma_m=None if place is None else 1e-3 * place.sigma_mm,
             partial=skin is not None and skin.partial,
+            beyond=verdict == "saturated" or (skin is not None and skin.beyond),
             load=Load(verdict, force_n, torque_nm, shear, self.flag_names),
         )
 
@@ -453,7 +454,7 @@ class Tip:
             return True
         if (now.load.verdict, now.load.flags) != (said.load.verdict, said.load.flags):
             return True
-        if now.partial is not said.partial:
+        if (now.partial, now.beyond) != (said.partial, said.beyond):
             return True
         change_n = math.dist(now.load.force_n, said.load.force_n)
         if change_n > max(0.25 * self.threshold_n, PRESSED_SHARE * math.hypot(*said.load.force_n)):

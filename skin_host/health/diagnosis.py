@@ -21,6 +21,8 @@ PERIOD_SHARE = 0.05
 JITTER_SHARE = 0.06
 #: This many lone frames (one of a pair) in the last second are a fault.
 FEW_HALVES = 2
+#: A bus with this load, of full frames, is full: what has the highest identifiers waits for ever.
+FULL_LOAD = 0.95
 #: So are this many pads of a bus that were off for one sweep, in the last ten seconds.
 FEW_SPIKED_PADS = 2
 #: Limit of the median shift of the temperature pads since the calibration, in units of the usual
@@ -104,12 +106,13 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[FoundFau
         if not (fault.code == "bus_loses_frames" and bus["name"] in doubled)
     ]
     quiet = {fault.where for fault in faults if fault.code in _SILENT}
+    loads = {bus["name"]: _load(bus) for bus in record["buses"]}
     silent: set[str] = set()
     for board in record["boards"]:
         if board["bus"] in quiet:
             silent.add(board["name"])
             continue
-        found = list(_board(board))
+        found = list(_board(board, loads.get(board["bus"], 0.0)))
         faults += found
         absent = any(fault.code in {"board_silent", "board_absent"} for fault in found)
         if absent or board.get("awaited"):
@@ -181,10 +184,12 @@ def _bus(bus: BusHealth) -> Iterator[FoundFault]:
             "see docs/receive.md",
         )
     if recent["halves"] >= FEW_HALVES:
+        why = "the bus is overloaded or badly terminated"
+        if recent["load"] >= FULL_LOAD:
+            why = f"the bus is overloaded: its load is {recent['load']:.0%}"
         yield fault(
             "bus_loses_frames",
-            f": single frames are lost, {recent['halves']} in the last second; "
-            "the bus is overloaded or badly terminated",
+            f": single frames are lost, {recent['halves']} in the last second; {why}",
         )
     spiked_pads = bus.get("spiked_pads", 0)
     if recent["wrong"] or spiked_pads >= FEW_SPIKED_PADS:
@@ -205,7 +210,14 @@ def _bus(bus: BusHealth) -> Iterator[FoundFault]:
         yield fault("bus_stranger", what, f"{name}/{address}")
 
 
-def _board(board: BoardHealth) -> Iterator[FoundFault]:
+def _load(bus: BusHealth) -> float:
+    """The share of a bus that was taken in the last second; 0: it is not known."""
+    recent = bus.get("last_second")
+    return 0.0 if recent is None else recent["load"]
+
+
+def _board(board: BoardHealth, load: float) -> Iterator[FoundFault]:
+    """Return the faults of a board on a bus of this load."""
     name = board["name"]
 
     def fault(code: str, sentence: str) -> FoundFault:
@@ -215,12 +227,21 @@ def _board(board: BoardHealth) -> Iterator[FoundFault]:
     if board.get("in_bootloader"):
         yield fault("board_in_bootloader", " is in its bootloader: no firmware runs")
     elif not board["alive"] and not board.get("awaited"):
+        full = ""
+        if load >= FULL_LOAD:
+            full = (
+                f"its bus is full (load {load:.0%}), and lower addresses go first: "
+                "have less sent on it, then "
+            )
         if board["sweeps"]:
             yield fault(
-                "board_silent", " has stopped sending and is being set up again; check its power"
+                "board_silent",
+                f" has stopped sending and is being set up again; {full}check its power",
             )
         else:
-            yield fault("board_absent", " has not sent anything yet; check power and address")
+            yield fault(
+                "board_absent", f" has not sent anything yet; {full}check power and address"
+            )
     if board.get("wrong_type"):
         yield fault(
             "board_wrong_type", f" reports type {board['board_type']}, which is no skin board"

@@ -2,6 +2,7 @@
 a file alone.
 """
 
+import codecs
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -75,15 +76,17 @@ class Findings:
 
 
 def read_source(path: Path, most_bytes: int) -> str:
-    """Read a file to import; what is no UTF-8 in it is replaced.
+    """Read a file to import: UTF-8, or UTF-16 by its byte order mark; what is neither is replaced.
 
     Raises:
         ConfigurationError: it cannot be read, or is larger.
     """
     try:
-        return read_whole(path, most_bytes).decode("utf-8", errors="replace")
+        content = read_whole(path, most_bytes)
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
+    is_wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return content.decode("utf-16" if is_wide else "utf-8-sig", errors="replace")
 
 
 def integer(word: str) -> int | None:

@@ -9,6 +9,7 @@ documentation of the MQTT integration ("MQTT discovery") and of its binary senso
 configuration are included.
 """
 
+import hashlib
 import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -34,8 +35,8 @@ INFO_SCHEMA: Final = "skin.info/1"
 #: As on the page and in `skin status`: anything but `ok` is a problem, with its sentences.
 PROBLEM: Final = "{{ 'OFF' if value_json.state == 'ok' else 'ON' }}"
 WHY: Final = "{{ {'state': value_json.state, 'sentences': value_json.sentences} | tojson }}"
-#: Health comes once a second. A broker that has stored the last one may be all that is left of a
-#: robot: after so many seconds without another it is unavailable.
+#: Health comes once a second, the contact state every 2 s. A broker that has stored the last ones
+#: may be all that is left of a robot: after so many seconds without another they are unavailable.
 EXPIRE_S: Final = 10
 #: A part that cannot feel is not "not touched": its contact is unavailable.
 FEELS: Final = (
@@ -310,20 +311,22 @@ def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
         topics: of the robot.
         info: of the node.
     """
-    skin = _identifier(topics.base)
-    alive = {"topic": topics.node("status", info.node)}
+    status = topics.node("status", info.node)
+    alive = {"topic": status}
     messages: dict[str, dict[str, Any]] = {}
     for part in [*info.parts, *info.fingertips]:
         health = topics.part("health", part)
-        messages[f"{skin}_{part}_contact"] = {
+        contact = topics.part("contact", part)
+        messages[_identifier(contact)] = {
             "name": f"{part} contact",
             "icon": "mdi:gesture-tap",
-            "state_topic": topics.part("contact", part),
+            "state_topic": contact,
             "value_template": STATE,
+            "expire_after": EXPIRE_S,
             "availability": [alive, {"topic": health, "value_template": FEELS}],
             "availability_mode": "all",
         }
-        messages[f"{skin}_{part}_problem"] = {
+        messages[_identifier(health)] = {
             "name": f"{part} problem",
             "device_class": "problem",
             "entity_category": "diagnostic",
@@ -337,7 +340,7 @@ def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
     common = {
         "qos": 1,
         "device": {
-            "identifiers": [f"{skin}_nodes_{info.node}"],
+            "identifiers": [_identifier(status)],
             "name": f"{info.robot} skin, node {info.node}",
             "sw_version": info.version,
         },
@@ -351,16 +354,19 @@ def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
 
 def discovery_topics(prefix: str, topics: Topics, part: str) -> list[str]:
     """Return the topics that announce a part or fingertip."""
-    skin = _identifier(topics.base)
-    return [_discovery_topic(prefix, f"{skin}_{part}_{what}") for what in ("contact", "problem")]
+    shown = topics.part("contact", part), topics.part("health", part)
+    return [_discovery_topic(prefix, _identifier(topic)) for topic in shown]
 
 
 def _discovery_topic(prefix: str, name: str) -> str:
     return f"{prefix}/binary_sensor/{name}/config"
 
 
-def _identifier(base: str) -> str:
-    """Return a name of letters, digits, `_` and `-`, which are all that a discovery topic may
-    have.
+def _identifier(topic: str) -> str:
+    """Return a name for what a topic of ours shows, of letters, digits, `_` and `-`, which are all
+    that a discovery topic may have.
+
+    Two topics have two names, also where they differ only in what such a name cannot have.
     """
-    return re.sub(r"[^a-zA-Z0-9_-]", "_", base)
+    readable = re.sub(r"[^a-zA-Z0-9_-]", "_", topic)
+    return f"{readable}_{hashlib.sha256(topic.encode()).hexdigest()[:8]}"

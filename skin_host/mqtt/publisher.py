@@ -67,6 +67,9 @@ from skin_host.processing.pipeline import PressureFrame
 FRAME_EXPIRY_S = 1
 #: A request of 64 KiB, with its topic and properties.
 MAX_PACKET_BYTES = 80_000
+#: So often the contact of a part is published again with its health, though it has not changed:
+#: another node that had the part before, and ends or starts later, publishes that it is unknown.
+CONTACT_AGAIN_S = 2.0
 MAX_CORRELATION_BYTES = 1024
 #: Waiting times after another daemon has taken this node's name, from the first to the longest.
 FIRST_TAKEN_S = 2.0
@@ -153,6 +156,7 @@ class Publisher:
         self._outbox = Outbox(settings.event_queue, settings.frame_hz, clock)
         self._outbox.put_state(self._status, ONLINE)
         self._states_of_contact: dict[str, ContactState] = {}
+        self._contact_put_s: dict[str, float] = {}
         self._numbers = Numbers(clock.now_ns, clock.monotonic_ns)
         self._turn = 0  # index of the broker in use
         self._untried = len(self._brokers)
@@ -265,14 +269,22 @@ class Publisher:
         self._outbox.put_touch(topic, event, self._event_properties)
 
     def put_contact(self, part: str, state: ContactState) -> None:
-        """Publish whether a part is touched, if that has changed."""
+        """Publish whether a part is touched, if that has changed; `put_health` repeats it."""
         if self._states_of_contact.get(part) != state:
             self._states_of_contact[part] = state
-            self._outbox.put_state(self.topics.part("contact", part), encode_contact(state))
+            self._publish_contact(part, state)
+
+    def _publish_contact(self, part: str, state: ContactState) -> None:
+        self._contact_put_s[part] = self._clock.monotonic_s()
+        self._outbox.put_state(self.topics.part("contact", part), encode_contact(state))
 
     def put_health(self, part: str, record: Any) -> None:
         """Publish the health of a part: a record with keys that JSON can hold."""
         self._outbox.put_state(self.topics.part("health", part), encode_health(record))
+        state = self._states_of_contact.get(part)
+        again_s = self._contact_put_s.get(part, 0.0) + CONTACT_AGAIN_S
+        if state is not None and self._clock.monotonic_s() >= again_s:
+            self._publish_contact(part, state)
 
     async def end_commands(self) -> None:
         """Cancel the commands that run, and refuse those that come from now on."""

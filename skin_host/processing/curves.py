@@ -55,7 +55,8 @@ class CurveVerdict(IntEnum):
     """Result for a pad from a recording under known pressure. From NOISY on it is not used."""
 
     GOOD = 0
-    #: The pad was not in the recording: it keeps the common curve.
+    #: The recording does not show its curve, because it was not in it or hardly moved: it keeps the
+    #: common curve.
     UNKNOWN = 1
     #: Its expected error is too large.
     NOISY = 2

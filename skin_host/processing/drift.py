@@ -77,8 +77,9 @@ EASED_SHARE = 0.8
 RELEASED_SHARE = 0.4
 #: ... and at most this much of it can be drift that was not followed.
 UNSEEN_UNITS = 3.5
-#: Where untouched taxels show the drift, that is no more than what the reading under the touch has
-#: risen by, and this share of the relaxation, by which the model of the foam may be wrong.
+#: It is no more than what may have drifted while a firm press hid it and no untouched taxel showed
+#: it, what the reading under the touch has risen by, and this share of the relaxation, by which the
+#: model of the foam may be wrong.
 MODEL_ERROR_SHARE = 0.25
 #: For so long that is found to be a load if the reading rises by more than this share of what free
 #: foam would have lost of it.
@@ -138,6 +139,10 @@ class BaselineTracker:
 
     Attributes:
         calibrated: float64[n], the baselines before any drift.
+        common_units: how much of what the untouched taxels have in common was followed in the last
+            window.
+        is_released: whether most of the taxels that were pressed of late are free, which shows that
+            what pressed the part has gone.
     """
 
     def __init__(
@@ -151,6 +156,8 @@ class BaselineTracker:
         n = len(baseline)
         self.baseline = baseline
         self.calibrated = baseline.copy()
+        self.common_units = 0.0
+        self.is_released = False
         self._configure(usable, settings)
         self._thermal = _ThermalReference(triangle, thermal) if np.any(thermal) else None
         #: Whether something may press on the whole part without any of its taxels being touched
@@ -213,7 +220,10 @@ class BaselineTracker:
         touched = touched & self._usable
         hidden = self._usable & (touched | missing)
         free = self._usable & ~hidden
-        recovering = free & (self._touches.touched_s > RECOVERED_S)
+        of_late = self._touches.touched_s > RECOVERED_S
+        recovering = free & of_late
+        pressed = np.count_nonzero(touched | (of_late & self._usable))
+        self.is_released = bool(2 * np.count_nonzero(recovering) > pressed)
         forecast = None
         if self._thermal is not None:
             forecast = self._thermal.step(units, self.baseline, free, missing, dt_s)
@@ -224,6 +234,7 @@ class BaselineTracker:
         shows = free & ~recovering
         share = _share(conversions)
         common = self._common(units, shows, received, np.where(shows | missing, share, 1.0), dt_s)
+        self.common_units = common
         if self._is_calm(units, common, hidden, dt_s):
             change = self._own(units - common, self._settings.rate_units_per_s * dt_s, dt_s)
             self._move(change + common, common, forecast)
@@ -241,11 +252,9 @@ class BaselineTracker:
         level = self.baseline + units + relaxed_units
         still = (np.abs(level - self._last) < TOLERANCE_UNITS) & ~missing
         self._last = level
-        change += self._touches.step(units, touched, dt_s, relaxed_units)
-        referenced = np.count_nonzero(free) >= REFERENCES
-        released = still & self._touches.released(
-            units, touched, relaxed_units if referenced else None
-        )
+        shown = bool(np.count_nonzero(free) >= REFERENCES)
+        change += self._touches.step(units, touched, dt_s, relaxed_units, shown)
+        released = still & self._touches.released(units, touched, relaxed_units)
         change[released] = units[released]
         ended = recovering & (self._free_s <= dt_s) & (self._taken_s <= 0.0)
         self._by_itself = (self._by_itself | ended) & ~released
@@ -488,6 +497,8 @@ class _Touches:
     def __init__(self, n: int) -> None:
         self.touched_s: Array = np.zeros(n)
         self.drifted: Array = np.zeros(n)
+        #: For how long they have been pressed firmly while no untouched taxel showed the drift.
+        self._hidden_s: Array = np.zeros(n)
         self._peak: Array = np.zeros(n)
         #: The smoothed reading, and its lowest value while the load was steady.
         self._level: Array = np.zeros(n)
@@ -501,9 +512,19 @@ class _Touches:
         self._fading_s = 0.0
 
     def step(
-        self, units: Array, touched: Mask, dt_s: float, relaxed_units: Array | float
+        self,
+        units: Array,
+        touched: Mask,
+        dt_s: float,
+        relaxed_units: Array | float,
+        shown: bool,
     ) -> Array | float:
-        """Return the slow rise [n] that the baselines of touched taxels follow."""
+        """Return the slow rise [n] that the baselines of touched taxels follow.
+
+        Args:
+            units, touched, dt_s, relaxed_units: see `BaselineTracker.step`.
+            shown: whether untouched taxels show the drift.
+        """
         if np.count_nonzero(touched):
             self._fading_s = 10.0 * SETTLE_S
         elif self._fading_s <= 0.0:
@@ -514,6 +535,8 @@ class _Touches:
         )
         self.touched_s += dt_s * touched
         np.fmax(self._peak, units, out=self._peak, where=touched)
+        if not shown:
+            self._hidden_s += dt_s * (touched & ~self._fallen(units))
 
         share = -math.expm1(-dt_s / SMOOTHING_S)
         distance = units - self._level
@@ -545,6 +568,7 @@ class _Touches:
         """Forget all but this share [n] of what is known."""
         self.touched_s *= kept
         self.drifted *= kept
+        self._hidden_s *= kept
         self._risen *= kept
         self._peak *= kept
 
@@ -553,19 +577,26 @@ class _Touches:
         """Whether any touch is still remembered."""
         return self._fading_s > 0.0
 
-    def released(self, units: Array, touched: Mask, relaxed_units: Array | float | None) -> Mask:
+    def released(self, units: Array, touched: Mask, relaxed_units: Array | float) -> Mask:
         """Return which touched taxels [n] read no more than a released contact and drift can
         leave.
 
         Args:
             units, touched: of the last step.
-            relaxed_units: the relaxation [n]; None if no untouched taxel shows the drift.
+            relaxed_units: the relaxation [n].
         """
-        unseen = np.minimum(SLOW_UNITS_PER_S * self.touched_s, UNSEEN_UNITS)
-        if relaxed_units is not None:
-            shown = self._risen + MODEL_ERROR_SHARE * relaxed_units + SMOOTH_TOLERANCE_UNITS
-            unseen = np.minimum(unseen, shown)
-        return touched & (units < RELEASED_SHARE * self._peak) & (units < unseen)
+        left = self._risen + MODEL_ERROR_SHARE * relaxed_units + SMOOTH_TOLERANCE_UNITS
+        left = np.minimum(left + SLOW_UNITS_PER_S * self._hidden_s, UNSEEN_UNITS)
+        left = np.minimum(left, SLOW_UNITS_PER_S * self.touched_s)
+        return touched & self._fallen(units) & (units < left)
+
+    def _fallen(self, units: Array) -> Mask:
+        """Return which taxels [n] read so much less than they did that what pressed them has gone.
+
+        What reads so little hides no drift: it would show as a rise.
+        """
+        fallen: Mask = units < RELEASED_SHARE * self._peak
+        return fallen
 
 
 def _share(conversions: Array | float) -> Array:

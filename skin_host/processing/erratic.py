@@ -1,4 +1,8 @@
-"""Detects pads that jump to and fro: a broken contact, not a pressure."""
+"""Detects pads that jump to and fro: a broken contact, not a pressure.
+
+Pads jump faster than a hand, which is seen where sweeps come fast; or scatter beyond their measured
+range, see `scatter`.
+"""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -9,6 +13,7 @@ from numpy.typing import NDArray
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.curves import Curve
 from skin_host.processing.masks import Mask
+from skin_host.processing.scatter import Scatter
 
 Floats = NDArray[np.float32]
 
@@ -31,13 +36,15 @@ CALM_S = 60.0
 
 
 class Erratic:
-    """Finds which of m pads jump up and down by more than their noise, faster than a hand.
+    """Finds which of m pads jump up and down by more than their noise, faster than a hand, or
+    scatter beyond their range.
 
     Pads that are read less than three times as often as a hand presses look alike, jumping or
-    tapped: none of them is found.
+    tapped: none of them is found within its range.
 
     Args:
         step_kpa: [m], smallest step that cannot be noise; inf where it is not known.
+        range_kpa: [m], pressure up to which each pad was measured.
 
     Attributes:
         pads: bool[m], the erratic pads; the array changes in place.
@@ -45,9 +52,10 @@ class Erratic:
         suspects: whether any pad has jumped of late.
     """
 
-    def __init__(self, step_kpa: NDArray[np.float64]) -> None:
+    def __init__(self, step_kpa: NDArray[np.float64], range_kpa: NDArray[np.float64]) -> None:
         m = len(step_kpa)
         self._step = step_kpa.astype(np.float32)
+        self._scatter = Scatter(self._step, range_kpa.astype(np.float32))
         self._score = np.zeros(m, np.float32)
         self._left_s = np.zeros(m)
         self._now_s = 0.0
@@ -72,8 +80,11 @@ class Erratic:
         before, self._before = self._before, rows[-1].copy()
         times_s = np.cumsum([self._now_s, *steps_s]).tolist()
         elapsed_s, self._now_s = times_s[-1] - self._now_s, times_s[-1]
-        # Few pads move that far at all; only those are looked at step by step.
         spread, lowest = rows.max(axis=0), rows.min(axis=0)
+        scattered = self._scatter.look(rows, steps_s, spread)
+        if len(scattered):
+            self._accuse(scattered)
+        # Few pads move that far at all; only those are looked at step by step.
         if before is not None:
             np.maximum(spread, before, out=spread)
             np.minimum(lowest, before, out=lowest)
@@ -92,9 +103,7 @@ class Erratic:
             beyond = found[self._score[found] >= LIMIT]
             if len(beyond):
                 self._score[beyond] = LIMIT
-                self._left_s[beyond] = CALM_S
-                self.pads[beyond] = True
-                self.any = True
+                self._accuse(beyond)
         elif not self.suspects:
             return
         self.suspects = bool(self._score.any())
@@ -103,6 +112,12 @@ class Erratic:
         """Let time pass in which no pad need be looked at."""
         self._now_s += elapsed_s
         self._before = None
+        self._scatter.wait()
+
+    def _accuse(self, pads: NDArray[np.intp]) -> None:
+        self._left_s[pads] = CALM_S
+        self.pads[pads] = True
+        self.any = True
 
     def _jumped(
         self,
@@ -142,6 +157,7 @@ class Erratic:
         self._rose[taxels] = False
         self._before = None
         self._began_s[:, taxels] = self._earlier_s[:, taxels] = -np.inf
+        self._scatter.reset(taxels)
         self.pass_time(0.0)
 
     def pass_time(self, dt_s: float) -> None:
@@ -154,8 +170,17 @@ class Erratic:
 
 def step_kpa(curve: Curve, noise_units: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the step [m] from sample to sample that a pad's noise does not reach."""
-    end = np.clip(curve.beyond_units, 1.0, 255.0)
     step: NDArray[np.float64] = (
-        np.maximum(STEP_DEVIATIONS * noise_units, STEP_UNITS) * curve.kpa(end) / end
+        np.maximum(STEP_DEVIATIONS * noise_units, STEP_UNITS) * range_kpa(curve) / _end_units(curve)
     )
     return step
+
+
+def range_kpa(curve: Curve) -> NDArray[np.float64]:
+    """Return the pressure [m] up to which the pads were measured."""
+    return curve.kpa(_end_units(curve))
+
+
+def _end_units(curve: Curve) -> NDArray[np.float64]:
+    end: NDArray[np.float64] = np.clip(curve.beyond_units, 1.0, 255.0)
+    return end

@@ -67,7 +67,8 @@ class Touch(
         partial: whether pads of the contact, or next to it, are not valid: more of it may be there
             than is felt.
         beyond: whether any of its pads is pressed beyond its calibrated range: pressures and force
-            are estimates, and bounds from below where readings are cut off.
+            are estimates, and bounds from below where readings are cut off. Also whether the board
+            of a fingertip is saturated; of its force this is so only then.
         reason: why it ended, only with an end.
         load: only of fingertips on force/torque boards.
         missed: of a received event: so many of its part were lost just before it.

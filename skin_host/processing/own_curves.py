@@ -5,14 +5,14 @@ from numpy.typing import NDArray
 
 from skin_host.processing.curves import Curve, Curves
 from skin_host.processing.drift import BaselineTracker
-from skin_host.processing.erratic import Erratic, step_kpa
+from skin_host.processing.erratic import Erratic, range_kpa, step_kpa
 from skin_host.processing.fitting.course import limit_kpa, make_memory
 from skin_host.processing.masks import Mask
 from skin_host.processing.relaxation import PlayRelaxation
 from skin_host.processing.smoothing import StepFilter
 
 #: Baselines of pads with own curves rise no faster above their calibrated zero (10 degrees in 10
-#: minutes are 0.008), and those of touched ones do not rise.
+#: minutes are 0.008), and those of touched ones do not rise before their release.
 RISE_UNITS_PER_S = 0.01
 #: A taxel that rests at this value or above sends 255 by noise alone.
 RESTING_NEAR_RAIL = 247.0
@@ -41,7 +41,7 @@ class OwnCurves:
         limit = np.where(own, limit_kpa(curve, noise), 0.0)
         self._smoother = StepFilter(limit, smoothing_s, np.float32)
         self._memory = make_memory(m, curves.memory, np.float32)
-        self.erratic = Erratic(np.where(own, step_kpa(curve, noise), np.inf))
+        self.erratic = Erratic(np.where(own, step_kpa(curve, noise), np.inf), range_kpa(curve))
         self._zeros = np.zeros(m, np.float32)
         self._reported = self._zeros
         self._touched: Mask | None = None
@@ -157,10 +157,11 @@ class OwnCurves:
         """Limit baselines to a slow rise, in place.
 
         A load that grows slowly, or has nearly gone, reads like drift; on a skin with known curves
-        it is more probable than drift.
+        it is more probable than drift. Where most of the part is released, it has gone: what a
+        pad reads then, within what foam and drift can leave, is taken for these at once.
 
         Args:
-            drift: with the baselines [m] that it would have.
+            drift: with the baselines [m] that it would have, by its last step.
             before: float64[m], the baselines of the window before.
             touched: bool[m], taxels whose baselines may not rise, but those of `drifted`.
             elapsed_s: how long the window was.
@@ -172,8 +173,10 @@ class OwnCurves:
         slow = RISE_UNITS_PER_S * elapsed_s
         highest = before + np.where(touched, 0.0, slow)
         if drifted is not None:
-            slowly = before[drifted] + slow
-            highest[drifted] = np.maximum(slowly, drift.calibrated[drifted])
+            # What the untouched ones show now is none of what was hidden.
+            shown = min(max(drift.common_units, 0.0), slow)
+            allowed = drift.baseline if drift.is_released else before + slow + shown
+            highest[drifted] = np.maximum(allowed, drift.calibrated)[drifted]
             reached = drift.baseline[drifted] <= highest[drifted]
             drifted = drifted[reached | ~self._own[drifted]]
         np.minimum(drift.baseline, highest, out=drift.baseline, where=self._own)

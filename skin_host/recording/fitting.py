@@ -35,12 +35,21 @@ from skin_host.processing.fitting.course import (
     following,
     median_of_moving,
     moves,
+    shown,
 )
 from skin_host.processing.fitting.hold import Fit, HoldRecord, fit, merge
+from skin_host.processing.fitting.memory import unloads
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model, parameters_of
 from skin_host.recording import seconds as in_seconds
-from skin_host.recording.load_table import LoadTable, check_course, check_covers, on_clock_of
+from skin_host.recording.load_table import (
+    LoadTable,
+    check_course,
+    check_covers,
+    check_untouched,
+    on_clock_of,
+    without_spikes,
+)
 from skin_host.recording.plausibility import check_ratio, describe_ratio
 from skin_host.recording.replay import calibrate_from_log, steps
 
@@ -72,7 +81,8 @@ IMPRINT_SHARE = 0.07
 #: A board is pressed if at least this share of its usable pads are. Of fewer, as at the edge of a
 #: bag of air on its neighbour, the pressure is not known.
 PRESSED_SHARE = 0.25
-#: Levels belong to a recording if at least this share of the pads of pressed boards can be fitted.
+#: Pressures belong to a recording if at least this share of the pads of pressed boards that answer
+#: can be fitted.
 LEAST_FITTED = 0.5
 #: Recordings have times in microseconds.
 LEAST_STEP_NS = 1000
@@ -95,6 +105,7 @@ class Samples:
         received: bool[n], taxels that were received at all.
         usable: bool[n], usable taxels.
         calibration: of the untouched skin at the beginning.
+        zero_s: how long that was.
     """
 
     dt_s: float
@@ -104,6 +115,7 @@ class Samples:
     received: Mask
     usable: Mask
     calibration: Calibration
+    zero_s: float
 
     def units(self, rows: slice, taxels: Mask) -> Floats:
         """Activations above the baseline of some samples and taxels."""
@@ -123,12 +135,16 @@ class Fitted(Generic[Found]):
         found: what was fitted, only to the pads of boards that were pressed.
         pressed: bool[n], the pads that were received of these boards.
         ratio: known pressures over those of the common curve, of the median pad.
+        unshown: bool[n], those of them of which the recording does not show a curve.
+        unloads: whether the foam's hysteresis is known, by this recording or before it.
     """
 
     calibration: Calibration
     found: Found
     pressed: Mask
     ratio: float
+    unshown: Mask
+    unloads: bool = True
 
 
 def read_samples(
@@ -186,7 +202,9 @@ def read_samples(
         usable[mine] = calibration.usable[mine] & (valid.mean(axis=0) > 0.5)
     zero = layout.no_load - calibration.baseline
     received = ~np.isin(calibration.verdict, (Verdict.ABSENT, Verdict.TOO_FEW))
-    return Samples(step_ns * 1e-9, first_ns * 1e-9, raw, zero, received, usable, calibration)
+    return Samples(
+        step_ns * 1e-9, first_ns * 1e-9, raw, zero, received, usable, calibration, seconds
+    )
 
 
 def hold_record(
@@ -373,16 +391,11 @@ def fit_pressures(
     ratio = float(np.median(np.sum(common * level, axis=0) / np.sum(common**2, axis=0)))
     check_ratio(ratio)
     result = fit_gains(np.array(levels_kpa), np.array(linear), np.array(square), usable)
-    pads = int(np.count_nonzero(usable & (layout.pad_kind == PadKind.PRESSURE)))
-    if result.fitted.sum() < LEAST_FITTED * pads:
-        raise RequestError(
-            f"{result.fitted.sum()} of {pads} pads of the pressed boards can be fitted, wanted at "
-            f"least {LEAST_FITTED:.0%}; {describe_ratio(ratio)}"
-        )
+    _check_share(result.fitted, usable & (layout.pad_kind == PadKind.PRESSURE), ratio)
     pressed = samples.received & boards
     curves = None if before is None else _without(before.curves, pressed)
     calibration = _renewed(samples, before, pressed, result.gain, result.bend, curves)
-    return Fitted(calibration, result, pressed, ratio)
+    return Fitted(calibration, result, pressed, ratio, np.zeros_like(pressed))
 
 
 def fit_curves(
@@ -394,14 +407,16 @@ def fit_curves(
 ) -> Fitted[Curves]:
     """Fit a curve to every pad, and the foam's memory, from any course of known pressure.
 
-    Boards that are not pressed keep what they have in the calibration `before`. If curves are among
-    it, the foam's memory stays as well, because it belongs to them.
+    Boards that are not pressed, and pads that the pressure moves too little to show a curve, keep
+    what they have in the calibration `before`. If curves are among it, the foam's memory stays as
+    well, because it belongs to them.
 
     `load` is the pressure on all pads alike.
 
     Raises:
         RequestError: the table is no course of pressure, not of this recording or in another unit,
-            or nothing is pressed.
+            or not that of untouched skin at first; nothing is pressed, or too few pads can be
+            fitted.
     """
     check_course(load)
     path, time_s, kpa = load = on_clock_of(load, samples.start_s)
@@ -414,19 +429,41 @@ def fit_curves(
     try:
         lag_s = find_lag(median_of_moving(units[:, pads], samples.dt_s), now_s, (time_s, kpa))
         pressure = np.interp(now_s + lag_s, time_s, kpa)
+        steady = np.interp(now_s + lag_s, time_s, without_spikes(load).kpa)
+        check_untouched(steady, samples.zero_s, samples.dt_s)
         boards = _pressed_boards(following(units, pressure, samples.dt_s), samples, layout)
         pressed = samples.received & boards
-        kept = None if before is None else _without(before.curves, pressed)
-        memory = kept.memory if kept is not None and kept.own.any() else None
         course = replace(course, there=pads & boards, pressure_kpa=pressure, lag_s=lag_s)
+        renewed = pressed & (shown(course) | ~pads)
+        kept = None if before is None else _without(before.curves, renewed)
+        memory = kept.memory if kept is not None and kept.own.any() else None
         curves = fit_course(course, settings.processing.pressure.smoothing_s, memory)
         ratio = _over_common(curves, settings, layout)
         check_ratio(ratio)
+        answering = samples.usable & course.there & (curves.verdict != CurveVerdict.DEAD)
+        _check_share(curves.own, answering, ratio)
     except RequestError as error:
         raise RequestError(f"{path}: {error}") from None
-    one = np.ones(layout.n_taxels)
-    joined = curves if kept is None else _joined(kept, curves, pressed)
-    return Fitted(_renewed(samples, before, pressed, one, one, joined), curves, pressed, ratio)
+    gain, bend = np.ones(layout.n_taxels), np.ones(layout.n_taxels)
+    if before is not None:
+        gain, bend = (np.where(renewed, 1.0, old) for old in (before.gain, before.bend))
+    joined = curves if kept is None else _joined(kept, curves, renewed)
+    calibration = _renewed(samples, before, pressed, gain, bend, joined)
+    known = memory is not None or unloads(steady)
+    return Fitted(calibration, curves, pressed, ratio, pressed & ~renewed, known)
+
+
+def _check_share(fitted: Mask, pads: Mask, ratio: float) -> None:
+    """Check that enough of the pads [n] that answer are fitted [n].
+
+    Raises:
+        RequestError: the pressures are hardly those of this recording, or show little of it.
+    """
+    if np.count_nonzero(fitted & pads) < LEAST_FITTED * np.count_nonzero(pads):
+        raise RequestError(
+            f"{np.count_nonzero(fitted & pads)} of {np.count_nonzero(pads)} pads of the pressed "
+            f"boards can be fitted, wanted at least {LEAST_FITTED:.0%}; {describe_ratio(ratio)}"
+        )
 
 
 def _over_common(curves: Curves, settings: Settings, layout: Layout) -> float:

@@ -21,6 +21,10 @@ LEAST_KPA = 10.0
 #: Samples may be missing for this long, or for this multiple of their usual distance.
 LONGEST_GAP_S = 1.0
 GAP_SAMPLES = 10.0
+#: A spike of the sensor's line, not of the air, is shorter than this, or one sample.
+SPIKE_S = 0.05
+#: Skin is untouched under less than this: chambers of air keep some kPa, pads feel about one unit.
+UNTOUCHED_KPA = 10.0
 #: At least this share of the recording, or of its hold, must lie within the table.
 COVERED_SHARE = 0.95
 #: A table that begins before this many seconds counts them from its recording's start.
@@ -95,6 +99,35 @@ def check_course(table: LoadTable) -> None:
         raise RequestError(
             f"{path}: a gap of {gaps[longest]:.1f} s after {time_s[longest]:g} s; "
             "wanted the pressure throughout the recording"
+        )
+
+
+def without_spikes(table: LoadTable) -> LoadTable:
+    """Return a table without spikes: each pressure is the median of those around it."""
+    step_s = float(np.median(np.diff(table.time_s)))
+    half = max(round(SPIKE_S / step_s), 1)
+    around = np.pad(table.kpa, half, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(around, 2 * half + 1)
+    return table._replace(kpa=np.asarray(np.median(windows, axis=1)))
+
+
+def check_untouched(kpa: Floats, zero_s: float, dt_s: float) -> None:
+    """Check that nothing presses while the skin is zeroed.
+
+    Args:
+        kpa: pressures [t] during a recording, without spikes.
+        zero_s: of its first seconds the zero is taken.
+        dt_s: distance of the pressures.
+
+    Raises:
+        RequestError: there is a pressure that pads feel, over ambient or over the lowest.
+    """
+    zero_kpa = kpa[: max(round(zero_s / dt_s), 1)]
+    if float(zero_kpa.max()) - min(float(kpa.min()), 0.0) > UNTOUCHED_KPA:
+        raise RequestError(
+            f"the first {zero_s:g} s of the recording, of which the zero is taken, are at "
+            f"{zero_kpa.min():.0f} to {zero_kpa.max():.0f} kPa; wanted untouched skin then, at "
+            f"{UNTOUCHED_KPA:g} kPa over ambient or less"
         )
 
 

@@ -9,6 +9,7 @@ files; a cluster's workers must find them under the same absolute paths.
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from skin_host.bus.logs import WINDOW_NS, name_in, read_channels
+from skin_host.bus.logs import WINDOW_NS, channel_names, name_in, read_channels
 from skin_host.bus.wire import FrameBatch, in_slices
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import LogError, RequestError, SkinError, required
@@ -50,26 +51,26 @@ def read_buses(
 ) -> Iterator[tuple[str, FrameBatch]]:
     """Yield batches of a recording with the name of the configured bus they belong to.
 
-    With one bus in the configuration all frames belong to it, whatever the recording calls its
-    channel. With several, channels go by name, or by the number that the format has in its place;
-    others are ignored.
+    Channels go by name, or by the number that the format has in its place; others are ignored: the
+    boards of two buses have the same addresses. With one bus in the configuration, the only channel
+    of a recording is that bus, whatever it is called.
 
     A batch spans `window_ns` at most, but for damaged time stamps.
 
     Raises:
-        LogError: see `logs.read_channels`; or several buses, and none of their channels in it.
+        LogError: see `logs.read_channels`; or none of its channels is that of a bus.
     """
-    merged = len(settings.buses) == 1
+    only = _only_channel(log, settings) if len(settings.buses) == 1 else None
     if is_mcap(log):
         from skin_host.recording.mcap import read_can
 
-        channels = _in_windows(read_can(log), window_ns)
+        recorded = ((name, batch) for name, batch in read_can(log) if only in (None, name))
+        channels = _in_windows(recorded, window_ns)
     else:
-        channels = read_channels(log, window_ns, merged=merged)
-    if merged:
-        (only,) = settings.buses
-        for _, batch in channels:
-            yield only, batch
+        channels = read_channels(log, window_ns, only)
+    if only is not None:
+        (bus,) = settings.buses
+        yield from ((bus, batch) for _, batch in channels)
         return
     called = {name: name_in(log, bus.channel) for name, bus in settings.buses.items()}
     names = Counter(called.values())
@@ -82,10 +83,44 @@ def read_buses(
         if name is not None:
             yield name, batch
     if not seen & set(bus_of):
-        raise LogError(
-            f"{log}: its channels are {', '.join(sorted(seen)) or 'unnamed'}; "
-            f"the configuration's are {', '.join(bus.channel for bus in settings.buses.values())}"
-        )
+        raise _other_channels(log, seen, settings)
+
+
+def _only_channel(log: Path, settings: Settings) -> str | None:
+    """Return what a recording calls the channel of the only bus; None if it has no frames.
+
+    Raises:
+        LogError: it has several channels, and none of this name; see `logs.channel_names`.
+    """
+    (bus,) = settings.buses.values()
+    wanted = {bus.channel, name_in(log, bus.channel)}
+    seen: set[str] = set()
+    for name in _names(log):
+        if name in wanted:
+            return name
+        seen.add(name)
+    if len(seen) > 1:
+        raise _other_channels(log, seen, settings)
+    return next(iter(seen), None)
+
+
+def _names(log: Path) -> Iterator[str]:
+    """Yield the channels of a recording when their frames come, until it ends or is damaged."""
+    if not is_mcap(log):
+        yield from channel_names(log)
+        return
+    from skin_host.recording.mcap import read_can
+
+    with suppress(LogError):
+        yield from (name for name, _ in read_can(log))
+
+
+def _other_channels(log: Path, seen: set[str], settings: Settings) -> LogError:
+    """Return the error of a recording without the channel of any bus."""
+    return LogError(
+        f"{log}: its channels are {', '.join(sorted(seen)) or 'unnamed'}; "
+        f"the configuration's are {', '.join(bus.channel for bus in settings.buses.values())}"
+    )
 
 
 def _in_windows(
@@ -147,7 +182,8 @@ def calibrate_from_log(
     """Calibrate on the first `seconds` of a recording, longer only if nothing is known from these.
 
     Raises:
-        LogError: unreadable, or without a single sweep of this skin.
+        LogError: unreadable, without a single sweep of this skin, or of boards that send so much
+            more slowly than configured that nothing of them counts.
     """
     engine = Engine(settings, layout, list(range(len(layout.parts))))
     engine.begin_calibration(seconds, NOISE_SAMPLES)
@@ -163,9 +199,28 @@ def calibrate_from_log(
             f"({sum(one.unknown_board for one in counters)} of other boards); wanted a recording "
             "made with this CONFIG, see `skin check CONFIG`"
         )
+    if not engine.calibration_progress() and (slow := _slow_boards(engine)):
+        raise LogError(
+            f"{log}: {slow}: so slow that each sweep comes after a silence, and nothing of it "
+            "counts; wanted boards.NAME.period_ms as in the recording"
+        )
     # A recording's calibration carries the recording's time, so that replays stay equal.
     time = datetime.fromtimestamp(last_ns / 1e9, UTC).isoformat(timespec="seconds")
     return engine.end_calibration(time)
+
+
+def _slow_boards(engine: Engine) -> str:
+    """Return in words which boards regularly send in longer periods than configured."""
+    found = []
+    for board in engine.boards:
+        seen_ns = engine.ledger.regular_period_ns(engine.ledger.row[board]) or 0.0
+        own = engine.layout.boards[board]
+        if seen_ns > own.settings.period_ms * 1e6:
+            found.append(
+                f"{own.name} sends every {seen_ns / 1e6:.0f} ms (configured: "
+                f"{own.settings.period_ms:g} ms)"
+            )
+    return ", ".join(found)
 
 
 def doubts(calibration: Calibration, settings: Settings, layout: Layout) -> list[str]:
@@ -241,14 +296,14 @@ def timed(log: Path, engine: Engine, window_ns: int = WINDOW_NS) -> Iterator[tup
     Raises:
         LogError: the recording cannot be read, or ends with damage.
     """
-    merged = len(engine.settings.buses) == 1
-    if not merged or engine.fingertips is not None:
+    is_alone = len(engine.settings.buses) == 1
+    if not is_alone or engine.fingertips is not None:
         window_ns = WINDOW_NS
     if engine.fingertips is not None:
         engine.fingertips.assume_scales()
     batches = read_buses(log, engine.settings, window_ns)
     # The frames of one bus come in their order, those of several bus by bus in each window.
-    yield from fed(batches, engine, 0 if merged else WINDOW_NS)
+    yield from fed(batches, engine, 0 if is_alone else WINDOW_NS)
 
 
 def steps(log: Path, engine: Engine) -> Iterator[Step]:

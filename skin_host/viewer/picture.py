@@ -82,6 +82,7 @@ class Picture:
         self.parts: dict[str, PartView] = {}
         self.version = 0
         self._nodes: dict[str, tuple[bool | None, NodeInfo | None]] = {}
+        self._holders: dict[str, str] = {}
         self._status: dict[str, Any] = {}
         self._status_changed = 0
         self._layout = b""
@@ -89,14 +90,23 @@ class Picture:
         self._states: dict[str, Contact] = {}
         self._health: dict[str, tuple[dict[str, Any], float]] = {}
 
-    def take_nodes(self, robot: str, nodes: dict[str, tuple[bool | None, NodeInfo | None]]) -> None:
-        """Take the present nodes: whether each is online, and its description."""
-        if self._nodes == nodes:
+    def take_nodes(
+        self,
+        robot: str,
+        nodes: dict[str, tuple[bool | None, NodeInfo | None]],
+        holders: dict[str, str],
+    ) -> None:
+        """Take the present nodes: whether each is online, and its description; and by part the node
+        that has it, which others may describe, too.
+        """
+        if (self._nodes, self._holders) == (nodes, holders):
             return
         told = {name: info for name, (_, info) in nodes.items() if info is not None}
-        if told != {name: info for name, (_, info) in self._nodes.items() if info is not None}:
-            self._lay_out(robot, told)
+        before = {name: info for name, (_, info) in self._nodes.items() if info is not None}
         self._nodes = dict(nodes)
+        if (before, self._holders) != (told, holders):
+            self._holders = holders
+            self._lay_out(robot, told)
 
     def take_status(self, status: dict[str, Any]) -> None:
         """Take the state of the connection to the broker; the nodes are added."""
@@ -173,12 +183,14 @@ class Picture:
             (node, name, len(part.pads), msgspec.to_builtins(part))
             for node, info in nodes.items()
             for name, part in info.parts.items()
+            if self._holders.get(name) == node
         ]
         # Last, as parts without taxels, because pages number frames by the parts alone.
         described += [
             (node, name, 0, {"fingertip": True} | _NO_TAXELS)
             for node, info in nodes.items()
             for name in info.fingertips
+            if self._holders.get(name) == node
         ]
         for number, (node, name, n_taxels, description) in enumerate(described[:MAX_PARTS]):
             view = old.get(name)
@@ -236,6 +248,9 @@ def _contacts_text(name: str, part: PartView, contact: Contact | None) -> str:
             "force_n": touch.force_n,
             "peak_kpa": touch.peak_kpa,
             "area_mm2": touch.area_mm2,
+            "partial": touch.partial,
+            "beyond": touch.beyond,
+            "verdict": None if touch.load is None else touch.load.verdict,
         }
         # Of what is not received any more, nobody knows whether it ended.
         for touch in (part.contacts if why in (None, "not_felt") else ())

@@ -242,7 +242,7 @@ class Viewer:
         answer: dict[str, Any] = {"type": "answer"}
         try:
             wish = from_json(message, _Wish)
-            answer["do"] = wish.do
+            answer |= {"do": wish.do, "node": wish.node}
             if not self._commands:
                 raise RequestError("commands are switched off; start the page with them allowed")
             if self._client is None:
@@ -319,7 +319,8 @@ class Viewer:
         """Watch the nodes and the connection."""
         while True:
             nodes = {name: (node.online, node.info) for name, node in client.nodes.items()}
-            self._picture.take_nodes(client.robot, nodes)
+            holders = {part: described.node for part, described in client.parts().items()}
+            self._picture.take_nodes(client.robot, nodes, holders)
             self._why = f"no broker at {client.where}: {client.last_error or 'trying again'}"
             self._take_status(connected=client.connected)
             await asyncio.sleep(NODES_S)

@@ -28,7 +28,11 @@ from skin_host.layout import build_layout
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.commands import MAX_RUNNING, CommandHandler, Result, decode_result
 from skin_host.processing import calibration as calibrations
-from skin_host.processing.calibration.file import load_calibration, save_calibration, with_gains_of
+from skin_host.processing.calibration.file import (
+    find_calibration,
+    load_calibration,
+    save_calibration,
+)
 from skin_host.recording.capture import CanLog, FrameRecorder, PageRecording
 from skin_host.recording.mcap import Recorder
 from tests.support.fault_bench import FaultBench
@@ -107,7 +111,7 @@ def test_a_calibration_that_another_program_is_writing_is_neither_used_nor_set_a
         with pytest.raises(BusyFileError, match=r"calibration\.json: another program is writing"):
             stored_calibration(settings, layout, "main")
         with pytest.raises(BusyFileError):
-            with_gains_of(calibrated.engine.calibration, path, layout)
+            find_calibration(path, layout, calibrated.engine.calibration.configuration)
         copy.write(whole[len(whole) // 2 :])
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
     assert stored_calibration(settings, layout, "main") is not None

@@ -193,7 +193,8 @@ async def put_frames(publisher: Publisher, layout: Layout) -> None:
 def test_more_parts_than_frames_can_name_are_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skin_host.viewer.picture.MAX_PARTS", 3)
     picture = Picture()
-    picture.take_nodes("robot", {"main": (True, pictures.info({f"p{n}": 1 for n in range(9)}))})
+    info = pictures.info({f"p{n}": 1 for n in range(9)})
+    picture.take_nodes("robot", {"main": (True, info)}, dict.fromkeys(info.parts, "main"))
     assert list(picture.parts) == ["p0", "p1", "p2"]
     picture.take_frame(pictures.frame("p5", [1.0]), pictures.NOW_S)
     assert picture.news(Cursor(), pictures.NOW_S)

@@ -1,5 +1,6 @@
 """Logs of candump are read in blocks: the same batches as line by line."""
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -90,6 +91,15 @@ def test_any_lines_make_the_same_batches(
     try:
         expected = list(line_by_line(path))
     except (ValueError, IndexError):
+        if lines[-1].strip() and not is_ended:
+            # The last line is unfinished, if the others are whole.
+            path.write_text("".join(line + newline for line in lines[:-1]), newline="")
+            with contextlib.suppress(ValueError, IndexError):
+                expected = list(line_by_line(path))
+        path.write_text(newline.join(lines) + newline * is_ended, newline="")
+        if expected:
+            assert in_blocks(path) == expected
+            return
         with pytest.raises(LogError, match=r"damaged after frame|cannot be read"):
             in_blocks(path)
         return
@@ -182,3 +192,43 @@ def test_one_channel_too_many_ends_a_recording_in_any_block(
     found, error = outcome(path)
     assert f"damaged after frame {last}: more than {logs.MOST_CHANNELS} channels" in error
     assert sum(len(frames) for _, frames in found) <= last
+
+
+LINE = "(1700000000.000125) can0 4E4#40F4F4\n"
+
+
+@pytest.mark.parametrize("cut", ["(17", "(1700000000.000225) can0 4E", "\0" * 300])
+def test_a_log_that_ends_in_the_middle_of_a_line_ends_there(
+    tmp_path: Path, cut: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "a.log"
+    path.write_text(LINE * 3 + cut)
+    assert len(in_blocks(path)[0][1]) == 3
+    (warning,) = caplog.messages
+    assert warning.startswith(f"{path}: ends in the middle of a line")
+    path.write_text(LINE * 3 + cut + "\n" + LINE)
+    with pytest.raises(LogError, match=r"damaged after frame 3: line 4: seen "):
+        in_blocks(path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+@pytest.mark.parametrize("block", [1, 1 << 20])
+def test_of_another_form_the_line_and_what_was_wanted_are_named(
+    tmp_path: Path, encoding: str, block: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logs, "BLOCK_BYTES", block)
+    path = tmp_path / "a.log"
+    path.write_text("\n  can0  4E4   [3]  40 F4 F4\n" * 2, encoding=encoding)
+    line = 2 if encoding == "utf-8" else 1
+    with pytest.raises(LogError, match=rf"line {line}: seen .* wanted .*`candump -L`, such as"):
+        in_blocks(path)
+
+
+@pytest.mark.parametrize("block", [1, 1 << 20])
+def test_a_mark_of_the_byte_order_is_none_of_the_first_line(
+    tmp_path: Path, block: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logs, "BLOCK_BYTES", block)
+    path = tmp_path / "a.log"
+    path.write_text(LINE * 3, encoding="utf-8-sig")
+    assert len(in_blocks(path)[0][1]) == 3

@@ -94,7 +94,7 @@ def test_channels_are_kept_apart(tmp_path):
     ]
 
 
-def test_channels_that_are_taken_for_one_bus_keep_their_order(tmp_path):
+def test_the_channel_of_the_only_bus_keeps_its_order_beside_another(tmp_path):
     lines = [f"({1 + n * 0.0005:.4f}) can{n % 3 % 2} {0x4E0 + n:X}#40" for n in range(16)]
     path = candump(tmp_path / "a.log", lines)
     settings = msgspec.convert(
@@ -108,7 +108,8 @@ def test_channels_that_are_taken_for_one_bus_keep_their_order(tmp_path):
     )
     for window_ns in (WINDOW_NS, 25 * MS):
         batches = [batch for _, batch in read_buses(path, settings, window_ns)]
-        assert np.concatenate([batch.id for batch in batches]).tolist() == [*range(0x4E0, 0x4F0)]
+        expected = [0x4E0 + n for n in range(16) if n % 3 != 1]
+        assert np.concatenate([batch.id for batch in batches]).tolist() == expected
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".csv", ".trc", ".log.gz", ".asc.gz"])
@@ -238,7 +239,7 @@ def test_frames_of_can_fd_are_passed_over(tmp_path):
 
 def test_a_time_that_no_clock_shows_ends_a_recording(tmp_path):
     far = candump(tmp_path / "far.log", ["(1.0) can0 4E0#40", "(99999999999999.0) can0 4E0#40"])
-    assert "damaged after frame 1: a time of 1e+14 s" in message_of(far)
+    assert "damaged after frame 1: line 2: a time of 1e+14 s" in message_of(far)
 
 
 def test_cut_files_are_told(tmp_path):

@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from skin_host.cli import build_parser, main, watch
-from skin_host.config.settings import skin_hash
+from skin_host.config.settings import load, skin_hash
+from skin_host.layout import build_layout
 from skin_host.processing.calibration.calibrator import Calibrator
+from skin_host.processing.calibration.file import load_calibration
 from tests.support.broker import free_port
 from tests.support.moments import at_import
 from tests.support.waiting import PATIENCE_S
@@ -162,6 +164,12 @@ def test_a_mistyped_word_comes_with_what_was_meant(typed, meant, capsys):
     assert meant in capsys.readouterr().err
 
 
+def skin_of(config):
+    """The layout of a configuration and its skin's hash."""
+    settings = load(config)
+    return build_layout(settings, config.parent), skin_hash(settings)
+
+
 def actions_of(parser):
     """All arguments of a command and of its sub-commands."""
     for action in parser._actions:
@@ -187,10 +195,11 @@ def test_a_status_without_broker_waits_for_none(capsys):
 def test_a_calibration_of_touched_skin_is_a_warning(options, status, tmp_path, monkeypatch, capsys):
     async def touched(settings, layout, *_, **__):
         calibrator = Calibrator(layout)
-        raw = np.full(layout.parts[0].n_taxels, 240, np.uint8)
+        raw, still = (np.full(part.n_taxels, 240, np.uint8) for part in layout.parts)
         for sweep in range(100):
             raw[3] = 240 if sweep < 70 else 150  # a finger comes and stays
             calibrator.add(0, raw, np.full(len(raw), fill_value=True))
+            calibrator.add(1, still, np.full(len(still), fill_value=True))
         return calibrator.finish(skin_hash(settings), "2026-01-01T00:00:00+00:00")
 
     monkeypatch.setattr("skin_host.daemon.calibrate.take_calibration", touched)
@@ -200,6 +209,51 @@ def test_a_calibration_of_touched_skin_is_a_warning(options, status, tmp_path, m
     (warning,) = (line for line in capsys.readouterr().err.splitlines() if "warning" in line)
     assert "taxel 3 of left_hand" in warning
     assert "repeat" in warning
+
+
+@pytest.fixture
+def looks_at(monkeypatch):
+    """Have `skin calibrate` look at untouched skin of which these bytes come, without the first
+    `absent` taxels of the hand.
+    """
+
+    def give(units, absent=0):
+        async def taken(settings, layout, *_, **__):
+            calibrator = Calibrator(layout)
+            for index, part in enumerate(layout.parts):
+                present = np.arange(part.n_taxels) >= absent * (part.name == "left_hand")
+                for _ in range(100):
+                    calibrator.add(index, np.full(part.n_taxels, units, np.uint8), present)
+            return calibrator.finish(skin_hash(settings), "2026-01-01T00:00:00+00:00")
+
+        monkeypatch.setattr("skin_host.daemon.calibrate.take_calibration", taken)
+
+    return give
+
+
+def test_pads_that_are_received_too_rarely_keep_what_the_file_has(looks_at, tmp_path, capsys):
+    kept = tmp_path / "kept.json"
+    command = ["calibrate", str(DEMO), "--output", str(kept), "--strict"]
+    looks_at(240)
+    assert main(command) == 0
+    looks_at(230, absent=24)
+    assert main(command) == 1
+    (warning,) = (line for line in capsys.readouterr().err.splitlines() if "warning" in line)
+    assert "taxels 0-23 of left_hand: received too rarely; they go on as before" in warning
+    found = load_calibration(kept, *skin_of(DEMO))
+    assert found.usable[:25].all()
+    assert found.baseline[24] - found.baseline[23] == pytest.approx(10.0)
+
+
+def test_pads_that_are_received_too_rarely_and_have_no_zero_are_a_warning(
+    looks_at, tmp_path, capsys
+):
+    looks_at(240, absent=24)
+    command = ["calibrate", str(DEMO), "--output", str(tmp_path / "kept.json")]
+    assert main(command) == 0
+    (warning,) = (line for line in capsys.readouterr().err.splitlines() if "warning" in line)
+    assert "taxels 0-23 of left_hand: received too rarely; not valid until calibrated" in warning
+    assert main([*command, "--strict"]) == 1
 
 
 @pytest.mark.parametrize(
@@ -280,7 +334,18 @@ def test_results_that_cannot_be_written_are_a_failure(words, unbuffered):
         text=True,
         env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
     )
-    refused(ended, 1, "No space left")
+    refused(ended, 1, "standard output: No space left")
+
+
+def test_a_report_without_the_package_for_pictures_is_refused_before_its_work(
+    monkeypatch, tmp_path
+):
+    def work(**_):
+        pytest.fail("it began its work")
+
+    monkeypatch.setattr("skin_host.evaluation.report.run", work)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    refused(asked("report", "--quick", "--output", str(tmp_path / "r")), 1, "skin-host[plots]")
 
 
 def test_a_terminal_without_a_character_shows_what_it_stands_for():

@@ -7,6 +7,7 @@ from typing import Any
 
 import aiomqtt
 import pytest
+from msgspec.structs import replace
 
 from skin_host.cli import main, watch
 from skin_host.config.settings import load
@@ -53,6 +54,28 @@ async def test_a_robot_that_is_switched_off_is_not_well(
         "nothing came of it for 0.3 s: is `skin run` running at node main?"
     ]
     assert (records["left_hand"]["taxels"], records["left_hand"]["valid_taxels"]) == (104, 0)
+
+
+async def test_a_part_that_has_moved_is_well_where_it_is_now(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever the broker keeps of nodes that had it before."""
+    monkeypatch.setattr(watch, "LIVE_S", 60.0)
+    async with aiomqtt.Client(mosquitto.host, mosquitto.port) as stranger:
+        for node, at in (("aa", b"offline"), ("main", b"online"), ("zz", b"offline")):
+            info = encode_info(replace(INFO, node=node))
+            nodes = f"skin/demo/nodes/{node}"
+            await stranger.publish(f"{nodes}/status", at, qos=1, retain=True)
+            await stranger.publish(f"{nodes}/info", info, qos=1, retain=True)
+        asked = status(mosquitto)
+        while not asked.done():
+            for part in INFO.parts:
+                health = json.dumps({"schema": "skin.health/1"} | WELL).encode()
+                await stranger.publish(f"skin/demo/{part}/health", health, qos=1)
+            await asyncio.sleep(0.1)
+    assert await asked == 0
+    records: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert {one["state"] for one in records.values()} == {"ok"}
 
 
 async def test_who_listens_to_a_robot_that_is_switched_off_learns_it(

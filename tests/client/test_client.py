@@ -18,7 +18,8 @@ from msgspec.structs import replace
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from skin_host.client import CommandError, Contact, SkinCallbacks, SkinClient
+from skin_host.client import CommandError, Contact, SkinCallbacks, SkinClient, session
+from skin_host.client.session import ANSWER_S, LEAST_STALE_S
 from skin_host.config.settings import Mqtt, changed, load
 from skin_host.errors import BrokerError, RequestError, SkinError, StateError
 from skin_host.layout import build_layout
@@ -136,7 +137,7 @@ async def test_what_the_broker_kept_of_a_robot_that_is_switched_off_is_not_known
 ) -> None:
     """After a power cut the broker has the last states, and nobody that corrects them."""
     await stored(mosquitto, contact=b"OFF", health=json.encode({"schema": "skin.health/1"}))
-    async with hearing(mosquitto, stale_s=0.3) as skin:
+    async with hearing(mosquitto, stale_s=LEAST_STALE_S) as skin:
         contacts = skin.contacts("palm")
         assert await take(contacts, 1) == [Contact("palm", "UNKNOWN", "stale")]
 
@@ -176,6 +177,43 @@ async def test_a_stream_that_ends_takes_nothing_from_the_others(mosquitto: Mosqu
         assert [one.part for one in skin._presence.reported()] == ["foot"]
         mosquitto.kill()
         assert await take(foot, 1) == [Contact("foot", "UNKNOWN", "disconnected")]
+
+
+async def test_who_reads_touches_alone_goes_on_knowing_those_that_last(
+    mosquitto: Mosquitto,
+) -> None:
+    """Whatever other streams end."""
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        touches, contacts = skin.touches(), skin.contacts("palm")
+        await skin.ready()
+        publisher.put_touch(touch(1, event="begin"))
+        publisher.put_contact("palm", "ON")
+        await take(contacts, 1)
+        await take(touches, 1)
+        del contacts
+        skin._ask_again()
+        await until(lambda: "skin/robot/palm/contact" not in skin._links[0]._subscribed)
+        assert [one.part for one in skin.present()] == ["palm"]
+        assert skin._presence.reported() == []
+        del touches
+        skin._ask_again()
+        await until(lambda: not skin._presence._parts)
+
+
+async def test_the_first_events_of_a_node_that_was_started_again_are_missed_and_counted(
+    mosquitto: Mosquitto,
+) -> None:
+    async with hearing(mosquitto) as skin:
+        touches = skin.touches()
+        await skin.ready()
+        for before in (0, 9):
+            async with publishing(mosquitto) as publisher:
+                publisher._outbox._counts["skin/robot/palm/touch"] = before
+                publisher.put_touch(touch(1 + before))
+                publisher.put_touch(touch(2 + before))
+                await publisher._outbox.drained()
+        seen = [(one.count, one.missed) for one in await take(touches, 4)]
+        assert seen == [(1, 0), (2, 0), (10, 9), (11, 0)]
 
 
 async def test_a_client_hears_what_was_said_while_its_link_was_cut(
@@ -356,8 +394,9 @@ async def test_a_command_that_fails_says_why(mosquitto: Mosquitto) -> None:
     async with publishing(mosquitto), hearing(mosquitto) as skin:
         with pytest.raises(CommandError, match="no board sent a sweep"):
             await skin.command("fail")
-        with pytest.raises(CommandError, match='no answer to "sleep" from node "main"'):
+        with pytest.raises(CommandError, match='no answer to "sleep" from node "main"') as failed:
             await skin.command("sleep", node="main", timeout_s=0.2)
+        assert "within 0.2 s; it may still be carried out" in str(failed.value)
         with pytest.raises(CommandError, match='node "other"'):
             await skin.command("calibrate", node="other", timeout_s=0.2)
 
@@ -668,6 +707,69 @@ def test_a_time_that_is_none_is_refused(name: str, seconds: float) -> None:
     """Without a number no part would ever be stale."""
     with pytest.raises(RequestError, match=f"{name}: seen {seconds}, wanted seconds from 0 on"):
         SkinClient(robot="robot", **{name: seconds})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.8, 1.49])
+def test_a_part_is_not_called_stale_between_two_records_of_its_health(seconds: float) -> None:
+    with pytest.raises(RequestError, match=f"stale_s: seen {seconds}, wanted 1.5 s or more"):
+        SkinClient(robot="robot", stale_s=seconds)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "lasts_s"),
+    [(12, 12.0), (0.5, 0.5), (-1, 0.0), (math.inf, 0.0), (math.nan, 0.0), ("3", 0.0), (None, 0.0)],
+)
+async def test_a_command_that_lasts_is_waited_for_that_long(
+    mosquitto: Mosquitto, seconds: Any, lasts_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited_s: list[float | None] = []
+
+    class Timeout:
+        def __init__(self, seconds: float | None) -> None:
+            waited_s.append(seconds)
+
+        async def __aenter__(self) -> None:
+            raise TimeoutError
+
+        async def __aexit__(self, *_: object) -> None:
+            pass
+
+    assert session._duration_s({"seconds": seconds}) == lasts_s
+    if isinstance(seconds, float) and not math.isfinite(seconds):
+        return
+    async with hearing(mosquitto) as skin:
+        monkeypatch.setattr(asyncio, "timeout", Timeout)
+        with pytest.raises(CommandError, match="no answer"):
+            await skin.command("calibrate", seconds=seconds)
+        monkeypatch.undo()
+    assert waited_s == [ANSWER_S + lasts_s]
+
+
+async def test_who_cannot_read_frames_gets_an_error_once_and_the_log_each_reason(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def missing(*_: object) -> None:
+        raise SkinError("CBOR frames need the package cbor2")
+
+    async with publishing(mosquitto, encoding="cbor") as publisher, hearing(mosquitto) as skin:
+        frames, others, touches = skin.frames("palm"), skin.frames("foot"), skin.touches()
+        await skin.ready()
+        await stored(mosquitto, touch=b"{not json")
+        await until(lambda: skin.unreadable)
+        monkeypatch.setattr("skin_host.mqtt.frames._decode_cbor_frame", missing)
+        with pytest.raises(SkinError, match="need the package cbor2"):
+            async with asyncio.timeout(PATIENCE_S):
+                publisher.put_frame(frame(1))
+                await anext(frames)
+        monkeypatch.undo()
+        # It is raised once: who reads on gets what can be read.
+        for number in (2, 3):
+            publisher.put_frame(frame(number))
+        assert (await take(frames, 1))[0].seq > 1
+        assert skin.unreadable == 2
+        assert others._refusals == touches._refusals == type(others._refusals)()
+    assert caplog.text.count("such messages are passed over") == 2
+    assert caplog.text.count("need the package cbor2") == 1
 
 
 @pytest.mark.parametrize("seconds", [math.nan, -1.0])

@@ -14,7 +14,7 @@ from skin_host.client import Contact, SkinCallbacks, session
 from skin_host.client.heard import is_online
 from skin_host.client.order import Newest
 from skin_host.client.presence import DISTANCE_S, MAX_TOUCHES, Lateness, Presence
-from skin_host.client.session import NAMED_S
+from skin_host.client.session import LEAST_STALE_S, NAMED_S
 from skin_host.config.settings import load
 from skin_host.errors import RequestError
 from skin_host.layout import build_layout
@@ -127,6 +127,37 @@ def test_a_clock_that_was_set_back_looks_late_for_a_limited_time() -> None:
     assert late_s[int(2 * DISTANCE_S) + 2 :] == [0.0] * (399 - int(2 * DISTANCE_S) - 2)
 
 
+@pytest.mark.parametrize("step_s", [-600.0, -5.0, 5.0, 600.0])
+def test_a_clock_that_was_set_shows_with_the_next_connection_and_makes_nothing_stale(
+    step_s: float,
+) -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0, sent_s=1e6, connection=1)
+    shown = presence.changes(0.0)
+    for second in range(1, 10):
+        presence.take_sign("palm", float(second), 1e6 + second, 1)
+    for second in range(10, 300):
+        presence.take_sign("palm", float(second), 1e6 + second + step_s, 2)
+        shown += presence.changes(float(second))
+    assert shown == [Contact("palm", "OFF")]
+    # Within a connection stamps follow no clock that is set: what is late is late.
+    presence.take_sign("palm", 306.0, 1e6 + 300 + step_s, 2)
+    assert presence.contact("palm", 306.1) == Contact("palm", "UNKNOWN", "stale")
+
+
+def test_a_next_connection_whose_messages_come_as_late_as_those_before_is_late() -> None:
+    """The node has turned to a broker again that is held up all the time."""
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0, sent_s=0.0, connection=1)
+    for second in range(1, 100):
+        connection = 1 if second < 50 else 2
+        late_s = 6.0 if second > 10 else 0.0
+        presence.take_sign("palm", float(second), second - late_s, connection)
+    assert presence.contact("palm", 99.0) == Contact("palm", "UNKNOWN", "stale")
+    presence.take_sign("palm", 100.0, 100.0, 2)  # it has caught up
+    assert presence.contact("palm", 100.0) == Contact("palm", "OFF")
+
+
 @given(
     st.lists(st.tuples(st.floats(0.0, 5.0), st.floats(0.0, 20.0)), min_size=1, max_size=50),
     st.floats(-1e9, 1e9),
@@ -144,7 +175,7 @@ def test_no_message_looks_later_than_it_is(
 
 def test_a_node_that_stops_takes_its_parts_with_it() -> None:
     presence = Presence(stale_s=3.0)
-    presence.take_info("arm", ["palm"])
+    presence.take_info("arm", ["palm"], 0.0)
     presence.take_node("arm", True, 0.0)
     presence.take_state("palm", "OFF", 0.0)
     presence.take_state("foot", "OFF", 0.0)
@@ -156,7 +187,7 @@ def test_a_node_that_stops_takes_its_parts_with_it() -> None:
 def test_a_last_will_says_nothing_of_a_node_that_may_be_at_another_broker() -> None:
     # The will of its old connection comes first; what it says over the new one comes 26 s late.
     newest, presence = Newest(), Presence(stale_s=3.0)
-    presence.take_info("main", ["palm"])
+    presence.take_info("main", ["palm"], 0.0)
 
     def take(payload: bytes, stamp: Stamp, broker: int) -> None:
         newness = newest.take("status", "main", stamp)
@@ -191,7 +222,7 @@ def test_with_one_broker_the_last_will_is_believed() -> None:
 
 def test_a_node_whose_parts_all_fall_silent_or_come_late_is_not_said_to_be_online() -> None:
     presence = Presence(stale_s=3.0)
-    presence.take_info("main", ["palm", "foot"])
+    presence.take_info("main", ["palm", "foot"], 0.0)
     presence.take_node("main", True, 0.0)
     presence.take_touch(seen("begin"), 0.0)
     assert presence.online("main", 60.0)  # who does not follow states cannot tell
@@ -295,7 +326,7 @@ def test_a_part_that_is_not_followed_any_more_is_forgotten() -> None:
     for part in ("palm", "foot"):
         presence.take_state(part, "OFF", 0.0)
     assert presence.changes(0.0) == presence.reported()
-    presence.forget("palm")
+    presence.forget_state("palm")
     assert presence.contact("palm", 1.0) is None
     assert [one.part for one in presence.reported()] == ["foot"]
 
@@ -303,7 +334,7 @@ def test_a_part_that_is_not_followed_any_more_is_forgotten() -> None:
 def test_a_state_that_is_deleted_is_unknown_and_so_is_each_loss_after_it() -> None:
     """Whoever clears retained messages must not make a motor move for ever."""
     presence = Presence(stale_s=3.0)
-    presence.take_info("arm", ["palm"])
+    presence.take_info("arm", ["palm"], 0.0)
     presence.take_node("arm", True, 0.0)
     presence.take_state("foot", None, 0.0)
     presence.take_state("palm", "OFF", 0.0)
@@ -321,6 +352,80 @@ def test_a_state_that_is_deleted_is_unknown_and_so_is_each_loss_after_it() -> No
     assert presence.changes(5.0) == [Contact("palm", "ON")]
 
 
+def test_of_a_part_that_is_followed_by_one_topic_less_the_rest_stays() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_touch(seen("begin", 7), 0.0)
+    presence.take_state("palm", "ON", 0.1)
+    assert presence.changes(0.1) == [Contact("palm", "ON")]
+    presence.forget_state("palm")
+    assert presence.reported() == []
+    assert [one.id for one in presence.touches("palm", 0.2)] == [7]
+    presence.take_state("palm", "ON", 0.3)
+    presence.forget_touches("palm")
+    assert presence.touches("palm", 0.3) == []
+    assert presence.contact("palm", 0.3) == Contact("palm", "ON")
+    presence.forget_state("palm")
+    presence.forget_touches("foot")
+    presence.forget_state("foot")
+    assert presence._parts == {}
+
+
+def test_a_touch_that_comes_before_its_state_stays_though_its_part_was_untouched() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0)
+    presence.take_touch(seen("begin", 7), 0.1)
+    presence.take_sign("palm", 0.2)
+    assert [one.id for one in presence.touches("palm", 0.2)] == [7]
+
+
+def test_a_state_that_its_only_broker_does_not_let_us_receive_any_more_is_not_known() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0, 0)
+    presence.take_state("foot", "OFF", 0.0, 0)
+    presence.take_state("foot", "OFF", 0.0, 1, again=True)
+    assert len(presence.changes(0.0)) == 2
+    for part in ("palm", "foot", "of which nothing is known"):
+        presence.take_refusal(part, 0)
+    assert presence.changes(0.1) == [Contact("palm", "UNKNOWN", "stale")]
+
+
+def test_no_contact_is_present_on_a_part_that_is_not_received() -> None:
+    def known(now_s: float) -> list[int]:
+        return [one.id for one in presence.touches(None, now_s)]
+
+    for follows_states in (True, False):
+        presence = Presence(stale_s=3.0)
+        presence.take_info("arm", ["palm"], 0.0)
+        presence.take_node("arm", True, 0.0)
+        presence.take_touch(seen("begin", 7), 0.0)
+        if follows_states:
+            presence.take_state("palm", "ON", 0.0)
+        assert known(0.1) == [7]
+        presence.take_node("arm", None, 0.2)  # it may have another connection
+        assert known(0.2) == []
+        presence.take_node("arm", True, 0.3)
+        assert known(0.4) == []  # it may have been started again
+        presence.take_touch(seen("move", 7), 0.5)
+        if follows_states:
+            assert known(3.4) == [7]
+            assert known(3.6) == []  # silent
+            presence.take_touch(seen("move", 7), 4.0)
+        presence.take_loss()
+        assert known(4.0) == []
+        presence.take_node("arm", False, 4.1)
+        presence.take_touch(seen("move", 7), 4.1)
+        assert known(4.1) == []
+
+
+def test_no_contact_is_present_of_a_part_whose_broker_is_lost_and_whose_node_is_not_known() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_touch(seen("begin", 7), 0.0)
+    presence.take_loss()
+    assert presence.touches(None, 0.1) == []
+    presence.take_touch(seen("move", 7), 0.2)
+    assert [one.id for one in presence.touches(None, 0.2)] == [7]
+
+
 STEPS = st.lists(
     st.one_of(
         st.tuples(st.just("state"), st.sampled_from(["ON", "OFF", "UNKNOWN", None]), st.booleans()),
@@ -336,7 +441,7 @@ STEPS = st.lists(
 def test_once_a_state_was_reported_no_loss_is_kept_quiet(steps: list[tuple[str, Any, Any]]) -> None:
     """Whatever was received, deleted and lost before: the last report is never out of date."""
     presence, now_s = Presence(stale_s=3.0), 0.0
-    presence.take_info("arm", ["palm"])
+    presence.take_info("arm", ["palm"], 0.0)
     presence.take_node("arm", True, now_s)
     last: Contact | None = None
     live_s = -10.0  # when something came that was not stored, over this connection and node
@@ -377,7 +482,7 @@ def test_once_a_state_was_reported_no_loss_is_kept_quiet(steps: list[tuple[str, 
 def test_what_the_broker_kept_is_not_known_until_something_comes() -> None:
     """After a power cut the broker has what was true before, and no node that could correct it."""
     presence = Presence(stale_s=3.0)
-    presence.take_info("arm", ["palm", "foot"])
+    presence.take_info("arm", ["palm", "foot"], 0.0)
     presence.take_node("arm", True, 0.0)
     for part in ("palm", "foot"):
         presence.take_state(part, "OFF", 0.0, stored=True)
@@ -392,7 +497,7 @@ def test_what_the_broker_kept_is_not_known_until_something_comes() -> None:
 def test_a_node_that_is_online_again_publishes_its_states_again() -> None:
     """Between its status and those, what it published before it was restarted is not known."""
     presence = Presence(stale_s=3.0)
-    presence.take_info("arm", ["palm"])
+    presence.take_info("arm", ["palm"], 0.0)
     presence.take_node("arm", True, 0.0)
     presence.take_state("palm", "OFF", 0.0)
     assert presence.changes(0.0) == [Contact("palm", "OFF")]
@@ -466,7 +571,7 @@ async def announced(publisher: Publisher) -> None:
 async def test_a_node_that_falls_silent_is_stale_and_one_that_ends_is_offline(
     mosquitto: Mosquitto,
 ) -> None:
-    async with hearing(mosquitto, stale_s=0.5) as skin:
+    async with hearing(mosquitto, stale_s=LEAST_STALE_S) as skin:
         contacts = skin.contacts("left_hand")
         await skin.ready()
         async with publishing(mosquitto) as publisher:
@@ -492,7 +597,10 @@ async def test_what_the_broker_kept_of_a_node_that_is_offline_is_never_off(
 
 @pytest.mark.parametrize("how", ["kill", "freeze"])
 async def test_a_lost_broker_makes_everything_unknown(mosquitto: Mosquitto, how: str) -> None:
-    async with publishing(mosquitto) as publisher, hearing(mosquitto, stale_s=1.0) as skin:
+    async with (
+        publishing(mosquitto) as publisher,
+        hearing(mosquitto, stale_s=LEAST_STALE_S) as skin,
+    ):
         contacts = skin.contacts()
         await skin.ready()
         await announced(publisher)
@@ -541,11 +649,11 @@ def test_the_parts_are_known_when_all_nodes_have_named_theirs_and_one_is_online(
     assert presence.named() is None
     presence.take_node("main", online=True, now_s=0.0)
     assert presence.named() is None
-    presence.take_info("main", ["palm"])
+    presence.take_info("main", ["palm"], 0.0)
     assert presence.named() == {"palm"}
     presence.take_node("arm", online=True, now_s=0.0, parts={"upper"})
     assert presence.named() is None  # its info may name more
-    presence.take_info("arm", ["lower"])
+    presence.take_info("arm", ["lower"], 0.0)
     assert presence.named() == {"palm", "upper", "lower"}
     # A node that has stopped may start again.
     presence.take_node("arm", online=False, now_s=0.0, parts={"upper"})
@@ -623,7 +731,7 @@ async def test_what_anybody_names_steers_no_terminal_and_is_cut(mosquitto: Mosqu
     async with hearing(mosquitto) as skin:
         await skin.ready()
         skin._presence.take_node("main", online=True, now_s=0.0)
-        skin._presence.take_info("main", presence_names)
+        skin._presence.take_info("main", presence_names, 0.0)
         stream = skin.touches("absent")
         skin._check_parts(asyncio.get_running_loop().time() + NAMED_S + 1.0)
         with pytest.raises(RequestError) as raised:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skin_host.client.heard import Contact, Health
+from skin_host.client.heard import Contact, Described, Health
 from skin_host.client.streams import HELD, HELD_TAXELS, Stream
 from skin_host.fingertip.events import Over
 from skin_host.mqtt.messages import Frame
@@ -99,6 +99,87 @@ async def test_what_a_slow_reader_loses_is_told() -> None:
     assert (first.count, first.missed) == (12, 10)
 
 
+@pytest.mark.parametrize("kind", ["touch", "frame"])
+async def test_what_is_lost_before_the_first_read_is_told(kind: Any) -> None:
+    """Nothing is lost without being counted, whenever the reader begins to read."""
+    stream: Stream[Any] = Stream(None, kind)
+    make: Any = touch if kind == "touch" else frame
+    n = HELD[kind] + 744
+    for number in range(1, n + 1):
+        stream.put(make(number), 7)
+    stream.close()
+    items = [item async for item in stream]
+    assert len(items) == HELD[kind]
+    assert items[0].missed == 744
+    assert sum(item.missed for item in items) + len(items) == n
+
+
+async def test_each_part_is_told_what_was_lost_of_it() -> None:
+    stream: Stream[Touch] = Stream(None, "touch")
+    stream._most = 3
+    for item in (touch(1), touch(4), touch(1, part="arm"), touch(5), touch(2, part="arm")):
+        stream.put(item)
+    stream.close()
+    seen = [(one.part, one.count, one.missed) async for one in stream]
+    assert seen == [("arm", 1, 0), ("palm", 5, 4), ("arm", 2, 0)]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "missed"),
+    [(30, 10, 9), (5, 200, 199), (5, 6, 5), (5, 1, 0), (5, 5, 4)],
+)
+@pytest.mark.parametrize("step_ns", [10**9, -(10**9)])
+async def test_what_is_lost_at_the_start_of_a_run_is_told(
+    before: int, after: int, missed: int, step_ns: int
+) -> None:
+    """Each run counts from 1, whatever the clock of its node shows."""
+    stream: Stream[Touch] = Stream(None, "touch")
+    stream.put(touch(before, 10**10), 7)
+    stream.put(touch(after, 10**10 + step_ns), 8)
+    stream.put(touch(after + 2, 10**10 + step_ns + 1), 8)
+    assert await heard(stream) == [(before, 0), (after, missed), (after + 2, 1)]
+
+
+async def test_without_the_number_of_its_run_a_smaller_number_shows_a_restart() -> None:
+    stream: Stream[Touch] = Stream(None, "touch")
+    for count in (30, 10):
+        stream.put(touch(count, t_ns=1000 - count))
+    assert await heard(stream) == [(30, 0), (10, 9)]
+
+
+async def test_frames_of_a_run_are_counted_from_0() -> None:
+    stream: Stream[Frame] = Stream(None, "frame")
+    stream.put(frame(70), 7)
+    stream.put(frame(3, 99), 8)
+    stream.close()
+    assert [item.missed async for item in stream] == [0, 3]
+
+
+@given(
+    st.lists(st.tuples(st.booleans(), st.integers(0, 5), st.booleans()), min_size=1, max_size=60)
+)
+def test_what_is_read_and_missed_is_all_that_was_sent(
+    steps: list[tuple[bool, int, bool]],
+) -> None:
+    """From the first event that came on, over restarts, whenever it is read."""
+    stream: Stream[Touch] = Stream(None, "touch")
+    stream._most = 4
+    run, count, t_ns, sent, read = 1, 0, 0, 0, 0
+    for restarts, lost, reads in steps:
+        if restarts:
+            run, count = run + 1, 0
+        count, t_ns = count + lost + 1, t_ns + 1
+        stream.put(touch(count, t_ns), run)
+        sent += 1 + (lost if sent else 0)
+        if reads:
+            while stream._items:
+                read += 1 + stream._take_out().missed
+            assert read == sent
+    while stream._items:
+        read += 1 + stream._take_out().missed
+    assert read == sent
+
+
 async def test_sweeps_between_two_frames_are_told() -> None:
     stream: Stream[Frame] = Stream(None, "frame")
     for seq in (7, 8, 7, 8, 12):  # each of two brokers sends them
@@ -157,6 +238,14 @@ def test_the_newest_state_of_each_part_is_held_while_there_is_room(parts: list[s
         stream.put(last[part])
         assert len(stream._items) <= 6
     assert {item.part: item for item in stream._items} == last
+
+
+async def test_descriptions_of_ever_other_parts_do_not_add_up() -> None:
+    stream: Stream[Described] = Stream(None, "info")
+    for number in range(2 * HELD["info"]):
+        stream.put(Described(f"part{number}", "", None))
+    assert len(stream._items) == HELD["info"]
+    assert (await anext(stream)).part == f"part{HELD['info']}"
 
 
 async def test_states_pass_as_they_are() -> None:

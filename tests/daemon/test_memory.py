@@ -22,7 +22,7 @@ from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Settings, changed, load, skin_hash
 from skin_host.daemon.calibrate import calibration_path
 from skin_host.daemon.daemon import Daemon
-from skin_host.daemon.memory import NodeMemory, hand_over, remembered
+from skin_host.daemon.memory import NodeMemory, hand_over, known_of, remembered
 from skin_host.daemon.state import NodeState, Thresholds, Zeros, kept_path, load_kept
 from skin_host.daemon.workers import share_name, share_of
 from skin_host.errors import OtherRobotError, OtherSkinError
@@ -677,3 +677,20 @@ def test_what_cannot_be_linked_is_copied_aside_and_a_folder_is_left(
     set_aside(path)
     assert "cannot be set aside: Operation not permitted" in caplog.text
     assert path.read_text() == "more damage"
+
+
+def test_a_zero_that_is_in_doubt_is_none_to_go_on_with(skin: Skin) -> None:
+    layout, kept = skin.layout, skin.calibration(10.0, 0.0)
+    first = layout.parts[1].start
+    zeros = Zeros(
+        calibration=kept.id,
+        unknown={"b": [3]},
+        touched={"b": [4]},
+        baselines=skin.baselines(7.0, "b"),
+    )
+    known = known_of(kept, zeros, layout)
+    assert np.flatnonzero(~known.zeroed).tolist() == [first + 3, first + 4]
+    assert known.baseline[first] == 7.0
+    assert known.baseline[:first] == pytest.approx(kept.baseline[:first])
+    other = known_of(replace(kept, id="other"), zeros, layout)
+    assert other.baseline == pytest.approx(kept.baseline)

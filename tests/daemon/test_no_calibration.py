@@ -1,5 +1,5 @@
 """A calibration that finds nothing tells boards that do not send from boards whose taxels are all
-unusable.
+unusable, and from boards that are zeroed again and again.
 """
 
 import asyncio
@@ -16,6 +16,7 @@ from skin_host.config.settings import Bus, changed, load
 from skin_host.daemon.calibrate import take_calibration
 from skin_host.errors import SkinError
 from skin_host.layout import build_layout, parts_of
+from skin_host.tasks import cancel
 from tests.support.live import CONFIG
 from tests.support.stepped import stepped
 
@@ -33,8 +34,23 @@ def chips_gone(*boards: str) -> Scene:
     return Scene(quiet=True, fault=faults)
 
 
-async def why_none(scene: Scene, hung: tuple[str, ...], clock: SteppedClock, place: Path) -> str:
-    """What `skin calibrate` answers beside a robot whose boards `hung` send nothing."""
+async def why_none(
+    scene: Scene,
+    hung: tuple[str, ...],
+    clock: SteppedClock,
+    place: Path,
+    restarting: tuple[str, ...] = (),
+) -> str:
+    """What `skin calibrate` answers beside a robot whose boards `hung` send nothing, and others
+    restart every 0.8 s.
+    """
+
+    async def restart(robot: Robot) -> None:
+        while restarting:
+            await clock.sleep(0.8)
+            for board in restarting:
+                robot.inject(Fault(name="board_reset", board=board))
+
     bus = Bus(interface="virtual", channel=place.name)
     settings = changed(load(CONFIG), {"buses.can0": bus, "service.state_directory": str(place)})
     layout = build_layout(settings, CONFIG.parent)
@@ -43,12 +59,12 @@ async def why_none(scene: Scene, hung: tuple[str, ...], clock: SteppedClock, pla
         robot.inject(Fault(name="board_silent", board=board))
     with can.Bus(interface=bus.interface, channel=bus.channel) as can_bus:
         body = asyncio.create_task(robot.run({"can0": can_bus}, RealClock(clock=clock)))
+        supply = asyncio.create_task(restart(robot))
         with pytest.raises(SkinError, match=r"^no calibration: ") as refusal:
             await take_calibration(
                 settings, layout, parts_of(layout, "main"), 1.5, lambda _: None, clock
             )
-        body.cancel()
-        await asyncio.gather(body, return_exceptions=True)
+        await cancel(body, supply)
     return str(refusal.value)
 
 
@@ -82,3 +98,13 @@ async def test_a_board_that_does_not_send_beside_one_without_chips_is_named(
     assert "board hand: triangles 0-4,8-11 not connected" in why
     for board in hung:
         assert f"board {board}: no sweep" in why
+
+
+@stepped
+async def test_of_boards_that_restart_again_and_again_nothing_is_kept(
+    clock: SteppedClock, tmp_path: Path
+) -> None:
+    why = await why_none(Scene(quiet=True), (), clock, tmp_path, restarting=BOARDS)
+    assert "no pad is usable by what was received: left_hand: " in why
+    assert "too few" in why
+    assert "times meanwhile, as by a restart: check with `skin scan` whether they keep" in why

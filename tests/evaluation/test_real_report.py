@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skin_host.cli import main
 from skin_host.errors import LogError
-from skin_host.evaluation import insole, page, real
+from skin_host.evaluation import insole, page, real, tables
 from skin_host.evaluation.insole import PADS, InsoleRecording
 from skin_host.evaluation.real import PlayedCourse
 from skin_host.processing.core import Engine
@@ -61,6 +63,13 @@ def write(folder: Path, made: InsoleRecording) -> Path:
     t_s = (made.t_ns - insole.START_NS) * 1e-9
     np.savez(path, t_s=t_s, counts=made.counts, pressure_kpa=made.pressure_kpa)
     return path
+
+
+#: A load from 8 to 13 s, which goes at once, and half a minute after it.
+UNLOADED = recording(
+    np.where(np.abs(np.arange(0.0, 43.0, PERIOD_NS * 1e-9) - 10.5) < 2.5, 105, 5.0)
+)
+UNUSED = np.zeros(PADS, np.bool_)
 
 
 @pytest.fixture(scope="module")
@@ -168,6 +177,73 @@ def test_a_pad_is_judged_by_the_frames_in_which_it_is_valid() -> None:
     row = real.pressure_errors(made, given, np.arange(PADS) == 7, None)
     assert row["median_rmse_kpa"] < 1e-4
     assert row["valid_share"] == pytest.approx(1.0 - 100 / len(made.t_ns))
+
+
+def test_what_follows_a_silence_is_judged_as_skin_replay_judges_it(
+    pressed: InsoleRecording,
+) -> None:
+    """After a silence a board may have another zero: it is not valid before it is compared."""
+    kept = np.delete(np.arange(len(pressed.t_ns)), np.s_[600:700])
+    with_gap = InsoleRecording(
+        pressed.name, pressed.t_ns[kept], pressed.counts[kept], pressed.pressure_kpa[kept]
+    )
+    settings, layout = insole.skin()
+    calibration = real.calibrate(with_gap, settings, layout)
+    played = real.play(with_gap, settings, layout, calibration)
+    last, first, later = np.searchsorted(played.t_ns, with_gap.t_ns[[598, 600, 700]])
+    assert played.valid[last].all()
+    assert not played.valid[first + 1].any()
+    assert played.valid[later].all()
+
+
+@given(
+    late_s=st.floats(0.0, 8.0),
+    stay=st.sets(st.integers(0, PADS - 1), max_size=20),
+    excess_kpa=st.floats(-4.0, 4.0),
+)
+def test_pads_count_as_touched_afterwards_that_still_are_ten_seconds_after_the_load(
+    late_s: float, stay: set[int], excess_kpa: float
+) -> None:
+    """What remains of the load within the skin's resolution is none."""
+    made = UNLOADED
+    pressure = made.pressure_kpa + np.where(made.t_ns - made.t_ns[0] > 13e9, excess_kpa, 0.0)
+    made = replace(made, pressure_kpa=pressure)
+    after_s = (made.t_ns - made.t_ns[0]) * 1e-9 - 13.0
+    touched = np.broadcast_to((after_s < late_s)[:, np.newaxis], (len(after_s), PADS)).copy()
+    touched[:, list(stay)] = True
+    usable = np.arange(PADS) >= 5
+    found = real.touched_afterwards(made, course(made, pressure, touched), usable)
+    assert found == len([pad for pad in stay if pad >= 5])
+
+
+def test_a_recording_that_ends_before_shows_nothing_of_what_is_touched_afterwards() -> None:
+    made = UNLOADED
+    everyone = np.ones(PADS, np.bool_)
+    ends = np.searchsorted(made.t_ns, made.t_ns[0] + 22_000_000_000)
+    short = InsoleRecording(
+        made.name, made.t_ns[:ends], made.counts[:ends], made.pressure_kpa[:ends]
+    )
+    assert real.touched_afterwards(short, course(short, short.pressure_kpa), everyone) is None
+    never = replace(made, pressure_kpa=np.full_like(made.pressure_kpa, 5.0))
+    assert real.touched_afterwards(never, course(never, never.pressure_kpa), everyone) is None
+
+
+def test_the_worst_pad_and_readings_that_are_far_off_are_named_however_few_they_are() -> None:
+    made = UNLOADED
+    given = course(made, made.pressure_kpa)
+    t, wrong = len(made.t_ns), slice(100, 200)
+    given.pressure_kpa[wrong, 7] += 80.0
+    given.pressure_kpa[wrong, 8] += 59.0
+    given.pressure_kpa[wrong, 9] += 500.0
+    given.valid[wrong, 9] = False
+    row = real.pressure_errors(made, given, np.ones(PADS, np.bool_), None)
+    assert row["worst_rmse_kpa"] == pytest.approx(80.0 * np.sqrt(100 / t), rel=1e-4)
+    assert row["far_share"] == pytest.approx(100 / (t * PADS - 100))
+    assert row["p95_rmse_kpa"] < 1e-4
+    names, (shown,) = tables.real({"real": [real.touches(made, given, UNUSED, UNUSED) | row]})
+    assert len(names) == len(shown)
+    assert shown[names.index("worst pad kPa")] == f"{row['worst_rmse_kpa']:.1f}"
+    assert shown[names.index("off by 60 kPa")] == f"{row['far_share']:.2%}"
 
 
 def test_one_json_document_has_a_row_for_each_recording(

@@ -17,6 +17,7 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -26,6 +27,7 @@ from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
+from skin_host.processing.events import Load
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.tasks import cancel
 from tests.support import ros
@@ -196,6 +198,67 @@ async def test_a_contact_pushes_against_the_normal_and_turns_the_part_about_its_
     assert vars(said.wrench.force) == {"x": 0, "y": 0, "z": -2.0}
     # 2 N down at x = 0.1 m: the x side goes down, which is a positive turn about y.
     assert vars(said.wrench.torque) == {"x": 0, "y": pytest.approx(0.2), "z": 0}
+
+
+def ros_example(monkeypatch: pytest.MonkeyPatch) -> tuple[ros.Node, Any, MagicMock]:
+    """Run the ROS 2 example without a robot: its node, its names, its client."""
+    ros.install(monkeypatch, enough=0)
+    skin = MagicMock()
+    skin.return_value.__enter__.return_value.present.return_value = []
+    monkeypatch.setattr(client, "SkinCallbacks", skin)
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py"])
+    names = runpy.run_path(str(EXAMPLES / "ros2_node.py"))
+    (node_made,) = ros.nodes
+    return node_made, SimpleNamespace(**names), skin.return_value.__enter__.return_value
+
+
+def test_the_wrench_in_ros_is_of_all_contacts_that_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    skin, example, known = ros_example(monkeypatch)
+
+    def pressed(number: int, force_n: float, **changes: Any) -> client.Touch:
+        return msgspec.structs.replace(BEGIN, id=number, force_n=force_n, **changes)
+
+    def shown() -> tuple[float, float]:
+        wrench = skin.published[-1][1].wrench
+        return wrench.force.z, wrench.torque.y
+
+    known.present.return_value = [pressed(1, 5.0), pressed(2, 3.0)]
+    example.on_touch(BEGIN)
+    assert shown() == pytest.approx((-8.0, 0.8))
+    known.present.return_value = [pressed(1, 5.0)]
+    example.on_touch(pressed(2, 0.0, event="end"))
+    assert shown() == pytest.approx((-5.0, 0.5))
+    known.present.return_value = []
+    example.on_contact(client.Contact("left_hand", "OFF"))
+    assert shown() == (0.0, 0.0)
+    example.on_contact(client.Contact("left_hand", "UNKNOWN", "offline"))
+    assert all(map(math.isnan, shown()))  # the node died: 0 N would be known
+    known.present.return_value = [pressed(3, 5.0, centroid_m=None)]
+    example.on_touch(BEGIN)
+    assert all(map(math.isnan, shown()))
+    load = Load("saturated", (0.0, 0.0, -41.0), (0.0, 0.25, 0.0), None, [])
+    known.present.return_value = [pressed(3, 41.0, centroid_m=None, load=load)]
+    example.on_touch(BEGIN)
+    assert shown() == (-41.0, 0.25)
+
+
+def test_the_example_for_ros_without_a_broker_ends_with_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ros.install(monkeypatch, enough=0)
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py", "http://x"])
+    with pytest.raises(SystemExit, match="the URL of the broker"):
+        runpy.run_path(str(EXAMPLES / "ros2_node.py"))
+
+
+@pytest.mark.parametrize("part", ["left-hand", "2nd", "arm"])
+def test_the_example_and_the_node_for_ros_name_parts_alike(
+    monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    skin, example, _ = ros_example(monkeypatch)
+    names = runpy.run_path(str(ROOT / "ros2/skin_host_ros/skin_host_ros/names.py"))
+    example.on_contact(client.Contact(part, "OFF"))
+    assert skin.made == [f"{names['ros_name'](part)}/wrench"]
 
 
 async def test_a_wrong_part_stops_the_motor_and_is_named(

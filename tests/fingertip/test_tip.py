@@ -401,6 +401,31 @@ def test_a_contact_of_skin_beside_pads_that_are_not_valid_is_partial_on_the_fing
     assert [one for one, _ in groupby(partial)] == [False, True, False]
 
 
+def test_a_load_beyond_the_range_of_the_board_is_only_a_bound() -> None:
+    bench = Bench()
+    told = [
+        event
+        for saturated in (False, True, False)
+        for event in touches(bench.hold(10, POINT, -2 * DIRECTION, saturated=saturated))
+    ]
+    told += touches(bench.hold(5, NOWHERE, NOWHERE))
+    assert [one for one, _ in groupby(event.beyond for event in told)] == [False, True, False]
+    assert {event.load.verdict for event in told if event.beyond and event.load} == {"saturated"}
+    assert (told[-1].event, told[-1].beyond) == ("end", False)
+
+
+def test_a_pad_beyond_its_range_marks_the_contact_of_the_fingertip_below_too() -> None:
+    bench = Bench(shape="plane", radius_mm=None)
+    felt = skin_contact(1, [0, 0, 0], 0.5)
+    told = []
+    for marked in (False, True, False):
+        bench.tip.note_skin([replace(felt, beyond=marked)], bench.t_ns)
+        told += touches(bench.hold(10, [0, 0, 0], [0, 0, -1.0]))
+    assert [one for one, _ in groupby(event.beyond for event in told)] == [False, True, False]
+    # Its force is measured all the same.
+    assert {event.load.verdict for event in told if event.load} == {"contact"}
+
+
 def test_skin_that_feels_two_contacts_tells_force_and_torque_that_they_are_several() -> None:
     bench = Bench(shape="plane", radius_mm=None)
     two = [skin_contact(1, [5, 0, 0], 0.5), skin_contact(2, [-5, 0, 0], 0.5)]

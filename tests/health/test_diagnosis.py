@@ -291,3 +291,26 @@ def test_taxels_are_named_in_runs_and_no_more_than_eight_of_them() -> None:
     eight = list(range(0, 16, 2))
     assert named(eight) == "taxels 0, 2, 4, 6, 8, 10, 12, 14"
     assert named([*eight, 16, 17]) == "taxels 0, 2, 4, 6, 8, 10, 12, 14, ... (10 in all)"
+
+
+@pytest.mark.parametrize(
+    ("sweeps", "code", "check"),
+    [(0, "board_absent", "check power and address"), (9, "board_silent", "check its power")],
+)
+def test_a_board_that_a_full_bus_starves_is_not_blamed_alone(
+    calibrated: FaultBench, sweeps: int, code: str, check: str
+) -> None:
+    record: Any = copy.deepcopy(calibrated.records["left_hand"])
+    record["boards"][0] |= {"alive": False, "sweeps": sweeps, "awaited": False}
+    sentences = {}
+    for load in (0.94, 1.028):
+        recent = {"load": load, "halves": 110}
+        faults = found(calibrated, boards=record["boards"], gained=recent)
+        sentences[load] = faults[code].sentence, faults["bus_loses_frames"].sentence
+    board, bus = sentences[0.94]
+    assert "full" not in board
+    assert bus.endswith("110 in the last second; the bus is overloaded or badly terminated")
+    board, bus = sentences[1.028]
+    assert "; its bus is full (load 103%), and lower addresses go first: have less" in board
+    assert board.endswith(check)
+    assert bus.endswith("110 in the last second; the bus is overloaded: its load is 103%")

@@ -18,7 +18,7 @@ from skin_host.config.explain import LARGEST
 from skin_host.config.fields import FileName
 from skin_host.config.settings import PlaceSettings, Settings, changed, load, parse_triangles
 from skin_host.errors import ConfigurationError, RequestError
-from skin_host.importing import configuration_text, import_files
+from skin_host.importing import Source, configuration_text, import_files
 from skin_host.importing.report import Findings
 from skin_host.layout import Layout, build_layout, builtin_kinds
 from skin_host.layout.geometry import lay
@@ -36,6 +36,24 @@ def built(path: Path) -> tuple[Settings, Layout]:
     return settings, build_layout(settings, path.parent)
 
 
+@needs_samples
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be"])
+@pytest.mark.parametrize(
+    ("source", "sample"), [("skinspec", SPEC), ("skingui", GUI), ("positions", POSITIONS)]
+)
+def test_a_file_with_a_byte_order_mark_is_the_same_file(
+    tmp_path: Path, source: Source, sample: Path, encoding: str
+) -> None:
+    text = sample.read_text()
+    copy = tmp_path / sample.name
+    made = []
+    for content in (text.encode(), ("\ufeff" * (encoding == "utf-16-be") + text).encode(encoding)):
+        copy.write_bytes(content)
+        settings, _, findings = run(source, copy)
+        made.append((settings, findings))
+    assert made[0] == made[1]
+
+
 @pytest.fixture
 def arm(tmp_path: Path) -> Path:
     """A small arm: a hand board of one fingertip and a palm, a forearm of two boards."""
@@ -51,11 +69,11 @@ def arm(tmp_path: Path) -> Path:
 
 
 def run(
-    source: str, file: Path, config: Path | None = None, part: str | None = None
+    source: Source, file: Path, config: Path | None = None, part: str | None = None
 ) -> tuple[Settings, Layout, str]:
     findings = Findings()
     output = file.parent / "out.toml"
-    import_files(source, [file], output, findings, config=config, part=part)  # type: ignore[arg-type]
+    import_files(source, [file], output, findings, config=config, part=part)
     return *built(output), "\n".join(str(item) for item in findings.items)
 
 

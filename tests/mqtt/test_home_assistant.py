@@ -11,8 +11,15 @@ import pytest
 
 from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
-from skin_host.mqtt.info import FingertipInfo, NodeInfo, discovery, node_info
-from skin_host.mqtt.publisher import Publisher
+from skin_host.mqtt.info import (
+    EXPIRE_S,
+    FingertipInfo,
+    NodeInfo,
+    discovery,
+    discovery_topics,
+    node_info,
+)
+from skin_host.mqtt.publisher import CONTACT_AGAIN_S, Publisher
 from skin_host.mqtt.topics import Topics
 from tests.support.broker import Mosquitto
 from tests.support.subscriber import Subscriber
@@ -55,12 +62,13 @@ def told(info: NodeInfo) -> dict[str, Any]:
 
 
 def test_a_contact_is_announced_as_documented(told: dict[str, Any]) -> None:
-    assert told["homeassistant/binary_sensor/skin_demo_left_hand_contact/config"] == {
-        "unique_id": "skin_demo_left_hand_contact",
+    assert told["homeassistant/binary_sensor/skin_demo_left_hand_contact_2c51d961/config"] == {
+        "unique_id": "skin_demo_left_hand_contact_2c51d961",
         "name": "left_hand contact",
         "icon": "mdi:gesture-tap",
         "state_topic": "skin/demo/left_hand/contact",
         "value_template": "{{ 'None' if value == 'UNKNOWN' else value }}",
+        "expire_after": 10,
         "qos": 1,
         "availability": [
             {"topic": "skin/demo/nodes/main/status"},
@@ -72,7 +80,7 @@ def test_a_contact_is_announced_as_documented(told: dict[str, Any]) -> None:
         ],
         "availability_mode": "all",
         "device": {
-            "identifiers": ["skin_demo_nodes_main"],
+            "identifiers": ["skin_demo_nodes_main_status_3da716ba"],
             "name": "demo skin, node main",
             "sw_version": "0.1.0",
         },
@@ -80,9 +88,14 @@ def test_a_contact_is_announced_as_documented(told: dict[str, Any]) -> None:
     }
 
 
+def test_what_lives_does_not_expire() -> None:
+    """Health comes once a second, the contact state with it now and then; both may be late."""
+    assert EXPIRE_S > 3 * CONTACT_AGAIN_S
+
+
 def test_a_problem_is_announced_as_documented(told: dict[str, Any]) -> None:
-    assert told["homeassistant/binary_sensor/skin_demo_left_forearm_problem/config"] == {
-        "unique_id": "skin_demo_left_forearm_problem",
+    assert told["homeassistant/binary_sensor/skin_demo_left_forearm_health_4147dd2f/config"] == {
+        "unique_id": "skin_demo_left_forearm_health_4147dd2f",
         "name": "left_forearm problem",
         "device_class": "problem",
         "entity_category": "diagnostic",
@@ -95,7 +108,7 @@ def test_a_problem_is_announced_as_documented(told: dict[str, Any]) -> None:
         "qos": 1,
         "availability": [{"topic": "skin/demo/nodes/main/status"}],
         "device": {
-            "identifiers": ["skin_demo_nodes_main"],
+            "identifiers": ["skin_demo_nodes_main_status_3da716ba"],
             "name": "demo skin, node main",
             "sw_version": "0.1.0",
         },
@@ -118,8 +131,37 @@ def test_every_key_is_one_of_the_documentation(told: dict[str, Any]) -> None:
 
 def test_a_base_of_several_words_makes_a_topic_of_one(info: NodeInfo) -> None:
     found = discovery("ha/x", Topics("lab 2/skin", "demo"), info)
-    topic = "ha/x/binary_sensor/lab_2_skin_demo_left_hand_contact/config"
+    topic = "ha/x/binary_sensor/lab_2_skin_demo_left_hand_contact_00e5b00d/config"
     assert json.loads(found[topic])["state_topic"] == "lab 2/skin/demo/left_hand/contact"
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (("skin", "arm", "left_hand"), ("skin", "arm_left", "hand")),
+        (("lab/x", "arm", "hand"), ("lab_x", "arm", "hand")),
+        (("skin", "arm 1", "hand"), ("skin", "arm_1", "hand")),
+        (("skin", "左", "hand"), ("skin", "右", "hand")),
+    ],
+)
+def test_two_robots_at_one_broker_have_no_entity_and_no_device_in_common(
+    info: NodeInfo, one: tuple[str, str, str], other: tuple[str, str, str]
+) -> None:
+    topics: list[set[str]] = []
+    names: list[set[str]] = []
+    for base, robot, part in (one, other):
+        mine = msgspec.structs.replace(
+            info, robot=robot, parts={part: info.parts["left_hand"]}, fingertips={}
+        )
+        found = discovery("homeassistant", Topics(base, robot), mine)
+        entities = [json.loads(payload) for payload in found.values()]
+        topics.append(set(found))
+        names.append({entity["unique_id"] for entity in entities})
+        names[-1] |= {name for entity in entities for name in entity["device"]["identifiers"]}
+        # What takes an entity back names the same topics.
+        assert set(discovery_topics("homeassistant", Topics(base, robot), part)) == set(found)
+    assert topics[0].isdisjoint(topics[1])
+    assert names[0].isdisjoint(names[1])
 
 
 @pytest.mark.parametrize(
@@ -144,8 +186,8 @@ def test_a_part_that_feels_nothing_is_unavailable_and_never_untouched(
     def said(template: str) -> str:
         return jinja2.Environment().from_string(template).render(value_json=record)
 
-    contact = told["homeassistant/binary_sensor/skin_demo_left_hand_contact/config"]
-    health = told["homeassistant/binary_sensor/skin_demo_left_hand_problem/config"]
+    contact = told["homeassistant/binary_sensor/skin_demo_left_hand_contact_2c51d961/config"]
+    health = told["homeassistant/binary_sensor/skin_demo_left_hand_health_3b1b3adc/config"]
     assert said(contact["availability"][1]["value_template"]) == feels
     assert said(health["value_template"]) == problem
     assert json.loads(said(health["json_attributes_template"])) == record
@@ -155,7 +197,7 @@ def test_a_part_that_feels_nothing_is_unavailable_and_never_untouched(
 def test_a_contact_that_is_unknown_is_none_to_home_assistant(
     told: dict[str, Any], value: str, state: str
 ) -> None:
-    contact = told["homeassistant/binary_sensor/skin_demo_left_hand_contact/config"]
+    contact = told["homeassistant/binary_sensor/skin_demo_left_hand_contact_2c51d961/config"]
     template = jinja2.Environment().from_string(contact["value_template"])
     assert template.render(value=value) == state
 
@@ -167,9 +209,9 @@ def test_a_fingertip_is_announced_like_a_part(info: NodeInfo) -> None:
         Topics("skin", "demo"),
         msgspec.structs.replace(info, fingertips={"tip": tip}),
     )
-    told = json.loads(found["homeassistant/binary_sensor/skin_demo_tip_contact/config"])
+    told = json.loads(found["homeassistant/binary_sensor/skin_demo_tip_contact_371d17a0/config"])
     assert told["state_topic"] == "skin/demo/tip/contact"
-    assert "homeassistant/binary_sensor/skin_demo_tip_problem/config" in found
+    assert "homeassistant/binary_sensor/skin_demo_tip_health_64e3e912/config" in found
 
 
 async def test_it_is_retained_on_the_broker_if_it_was_asked_for(

@@ -14,6 +14,7 @@ from msgspec import json
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
+from skin_host.clock import Clock
 from skin_host.config.settings import Mqtt
 from skin_host.errors import ConfigurationError, RequestError
 from skin_host.mqtt.order import Stamp
@@ -213,6 +214,31 @@ async def test_a_contact_that_did_not_change_is_not_said_again(mosquitto: Mosqui
                 await asyncio.sleep(0.05)
             await until(lambda: publisher.counters.retained_sent >= sent)
     assert [message.payload for message in seen.messages] == [b"ON", b"OFF", b"UNKNOWN", b"ON"]
+
+
+async def test_a_contact_is_published_again_with_health_now_and_then(mosquitto: Mosquitto) -> None:
+    """A node that had the part before, and starts or ends later, publishes that it is unknown."""
+    clock = Clock()
+    now_s = 1000.0
+    clock.monotonic_s = lambda: now_s
+    async with listening(mosquitto, "skin/+/+/contact") as seen:
+        async with Publisher(settings(mosquitto), "robot", clock=clock) as publisher:
+            await until(lambda: publisher.counters.connected)
+            publisher.put_health("palm", {})
+            publisher.put_contact("palm", "OFF")
+            await until(lambda: seen.payloads("contact") == [b"OFF"])
+            async with aiomqtt.Client(mosquitto.host, mosquitto.port) as former:
+                await former.publish("skin/robot/palm/contact", b"UNKNOWN", qos=1, retain=True)
+            await until(lambda: seen.payloads("contact") == [b"OFF", b"UNKNOWN"])
+            for second in range(1, 8):
+                now_s = 1000.0 + second
+                publisher.put_health("palm", {"age_ms": second})
+                publisher.put_contact("palm", "OFF")
+                await publisher._outbox.drained()
+            await until(lambda: len(seen.payloads("contact")) == 5)
+            publisher.put_contact("palm", "ON")  # a change comes at once
+            await until(lambda: len(seen.payloads("contact")) == 6)
+    assert seen.payloads("contact")[2:] == [b"OFF", b"OFF", b"OFF", b"ON"]
 
 
 async def test_a_broker_that_comes_late_gets_what_still_matters(

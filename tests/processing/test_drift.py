@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skin_host.config.settings import Drift
 from skin_host.processing.drift import BaselineTracker, paper_step, proportional_step
@@ -100,6 +102,41 @@ def test_what_is_left_of_a_contact_that_let_go_is_taken_for_drift():
     assert found[0] is None
     assert sorted(found[1]) == list(range(N))
     assert track.baseline == pytest.approx(np.full(N, 2.6))
+
+
+@given(st.integers(5, 600), st.floats(0.3, 4.0), st.integers(0, N))
+def test_as_much_is_left_by_drift_as_a_firm_press_may_have_hidden(seconds, left, ended):
+    """However many other taxels of the part have ended before: they did not show it either."""
+    track = tracker()
+    for _ in range(seconds):
+        follow(track, 0.0, ~NOBODY, press=35.0)
+    stays = np.arange(N) >= ended
+    found = [follow(track, 0.0, stays, press=left) for _ in range(2)][1]
+    most = min(0.01 * seconds + 0.25, 0.01 * (seconds + 2), 3.5)
+    if abs(left - most) > 0.02:
+        is_drift = left < most and ended < N
+        assert (found is not None) is is_drift
+        if is_drift:
+            assert found.tolist() == np.flatnonzero(stays).tolist()
+
+
+def test_a_hold_that_was_eased_to_little_hides_no_drift_however_long_it_lasts():
+    """What drifts meanwhile is in its reading."""
+    track = tracker()
+    for press in [35.0] * 60 + [3.0] * 3600:
+        assert follow(track, 0.0, ~NOBODY, press=press) is None
+    assert np.abs(track.baseline).max() < 0.1
+
+
+@pytest.mark.parametrize(("free", "is_released"), [(12, False), (13, True)])
+def test_a_part_is_released_where_most_of_what_was_pressed_of_late_is_free(free, is_released):
+    track = after_touch(~NOBODY, 60)
+    assert not track.is_released
+    follow(track, 0.0, np.arange(N) >= free, 25.0)
+    assert track.is_released is is_released
+    for _ in range(60):
+        follow(track, 0.0, np.arange(N) >= free, 25.0)
+    assert not track.is_released
 
 
 def test_what_is_left_after_a_short_contact_is_still_a_contact():

@@ -25,7 +25,7 @@ def look(found: Erratic, *kpa: float, period_s: float = PERIOD_S) -> None:
 
 
 def jumping(looks: int) -> Erratic:
-    found = Erratic(np.array([STEP_KPA, STEP_KPA, np.inf]))
+    found = Erratic(np.array([STEP_KPA, STEP_KPA, np.inf]), np.full(3, np.inf))
     for _ in range(looks):
         look(found, 0, 9, 0, 9)
     return found

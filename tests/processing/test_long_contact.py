@@ -6,6 +6,7 @@ import pytest
 from skin_host.evaluation.histories import record
 from skin_host.evaluation.rig import Rig
 from skin_host.layout import PadKind
+from tests.processing.fitting.test_course import use_own_curves
 from tests.support.long_hold import ALL, CURVE, FEW, hold
 
 TEN_MINUTES_S, TWO_HOURS_S, EIGHT_HOURS_S = 600.0, 7200.0, 28800.0
@@ -122,3 +123,59 @@ def test_no_drift_of_a_few_units_under_a_contact_latches_it(left_units):
     assert frame.touched.all()
     ghosts = [rig.step(left_units).touched.any() for _ in range(round(120 * hz))]
     assert not any(ghosts[-round(60 * hz) :])
+
+
+OWN_HZ = 4.0
+FIRM_UNITS = 20.0
+
+
+def own_curves() -> Rig:
+    rig = Rig(1, 0.3, seed=24, hz=OWN_HZ)
+    use_own_curves(rig, 0.3)
+    return rig
+
+
+def touched_under(rig, units, seconds, drift=0.0):
+    """Which pads [t, n] are touched under these activations, which drift by so much a second."""
+    steps = round(seconds * OWN_HZ)
+    return np.array([rig.step(units + drift * step / OWN_HZ).touched for step in range(steps)])
+
+
+def test_what_the_foam_of_some_pads_with_own_curves_keeps_of_a_long_press_is_no_touch_for_long():
+    """On recorded skin one pad in seven kept 2 to 4 units of minutes under 250 kPa. Half of what it
+    keeps here is explained by the foam's memory.
+    """
+    rig = own_curves()
+    kept = np.arange(rig.n) % 7 == 0
+    assert touched_under(rig, FIRM_UNITS, 300.0)[10:].all()
+    after = touched_under(rig, np.where(kept, 4.0, 0.0), 60.0)
+    assert not after[round(10 * OWN_HZ) :].any()
+
+
+@pytest.mark.parametrize("goes_on", [0.0, 0.003])
+def test_pads_with_own_curves_that_drifted_while_all_were_pressed_are_free_afterwards(goes_on):
+    """Though some read less than others, end at once, and show no drift from then on.
+
+    A few have their zero given back: noise looks like foam that pushes back.
+    """
+    rig = own_curves()
+    spread = np.linspace(-2.0, 1.0, rig.n)
+    touched_under(rig, FIRM_UNITS, 600.0, drift=0.006)
+    after = touched_under(rig, 3.6 + spread, 300.0, drift=goes_on)
+    assert after[0].any()
+    assert after[round(20 * OWN_HZ) :].mean() < 0.02
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("before_s", "units", "held_s"), [(0.0, 3.0, 3600.0), (60.0, 5.5, 1200.0)])
+@pytest.mark.parametrize("pressed", [FEW, 96, ALL])
+def test_a_light_hold_of_pads_with_own_curves_lasts(pressed, before_s, units, held_s):
+    """Also one that was firm before, on the whole part, the rest of which is free: of its 5.5
+    units the foam's memory takes three.
+    """
+    rig = own_curves()
+    here = np.arange(rig.n) < pressed
+    touched_under(rig, FIRM_UNITS, before_s)
+    during = touched_under(rig, np.where(here, units, 0.0), held_s)[round(10 * OWN_HZ) :]
+    assert during[:, here].all()
+    assert not during[:, ~here].any()

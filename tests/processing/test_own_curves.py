@@ -428,3 +428,31 @@ def test_a_touch_is_drift_only_where_its_baseline_may_rise_as_far():
     assert drift.baseline[[1, 2, 4, 5]] == pytest.approx([1.9, 2.02, 2.0 + 4.0 * 0.01, 9.0])
     drift.baseline[4] = 2.5
     assert own.hold_rises(drift, before, touched, 4.0, np.array([4])) is None
+
+
+def test_where_most_of_the_part_is_released_a_touch_is_drift_at_once():
+    own = OwnCurves(CURVE, curves(), slice(0, N), SMOOTHING_S)
+    before = np.full(N, 2.0)
+    drift = tracker(before)
+    drift.is_released = True
+    drift.baseline[[1, 2, 4]] += 2.0
+    touched = np.isin(np.arange(N), [1, 2, 4, 6])
+    found = own.hold_rises(drift, before, touched, 1.0, np.array([1, 2]))
+    assert found.tolist() == [1, 2]
+    assert drift.baseline[[1, 2]] == pytest.approx(4.0)
+    # Its touch is no drift.
+    assert drift.baseline[4] == 2.0
+
+
+@pytest.mark.parametrize("common_units", [-0.01, 0.0, 0.005, 0.3])
+def test_what_the_untouched_pads_show_is_followed_beside_what_was_hidden(common_units):
+    own = OwnCurves(CURVE, curves(), slice(0, N), SMOOTHING_S)
+    before = np.full(N, 2.0)
+    drift = tracker(before)
+    drift.common_units = common_units
+    drift.baseline[[1, 4]] += 2.0
+    touched = np.isin(np.arange(N), [1, 4])
+    assert own.hold_rises(drift, before, touched, 1.0, np.array([1])) is None
+    shown = min(max(common_units, 0.0), RISE_UNITS_PER_S)
+    assert drift.baseline[1] == pytest.approx(2.0 + RISE_UNITS_PER_S + shown)
+    assert drift.baseline[4] == 2.0

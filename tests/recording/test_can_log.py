@@ -13,13 +13,14 @@ from skin_host.bus.logs import read_channels
 from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from skin_host.bus.wire import FrameBatch
 from skin_host.cli import main
-from skin_host.config.settings import load
+from skin_host.config.settings import Settings, changed, load
 from skin_host.errors import LogError, RequestError, SkinError
 from skin_host.files import Disk, on_disk
 from skin_host.recording.capture import CanLog
 from skin_host.recording.mcap import Recorder, read_messages_of
 from skin_host.recording.replay import read_buses
 from tests.support.candump import write_config, write_log
+from tests.support.live import CONFIG
 
 START_NS = 1_700_000_000 * 10**9
 MS = 1_000_000
@@ -234,6 +235,47 @@ def test_a_channel_whose_name_is_no_word_is_read_as_it_was_written(
     assert [(name, batch.id.tolist()) for name, batch in read_buses(path, settings)] == [
         ("left", [0x4E2])
     ]
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".trc", ".mcap"])
+def test_the_other_bus_of_a_recording_is_none_of_a_configuration_with_one(
+    tmp_path: Path, suffix: str
+) -> None:
+    path = recording_of(tmp_path / f"a{suffix}", "can5", "can2")
+    for channel, identifier in (("can2", 0x4E2), ("can5", 0x4E5)):
+        read = [*read_buses(path, one_bus(channel))]
+        found = [(name, number) for name, batch in read for number in batch.id.tolist()]
+        assert found == [("can0", identifier)] * 20
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".mcap"])
+def test_a_recording_of_two_buses_that_are_others_names_them(tmp_path: Path, suffix: str) -> None:
+    path = recording_of(tmp_path / f"a{suffix}", "can5", "can2")
+    with pytest.raises(LogError, match=r"its channels are (can)?2, (can)?5; .* are can0$"):
+        list(read_buses(path, one_bus("can0")))
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".csv", ".mcap"])
+def test_the_only_bus_of_a_recording_is_that_of_the_configuration(
+    tmp_path: Path, suffix: str
+) -> None:
+    path = recording_of(tmp_path / f"a{suffix}", "can2")
+    found = [int(one) for _, batch in read_buses(path, one_bus("239.74.163.1")) for one in batch.id]
+    assert found == [0x4E2] * 20
+
+
+def recording_of(path: Path, *channels: str) -> Path:
+    """A recording of frames 0x4E2 on can2 and so on, in turn."""
+    with Recorder(path) if path.suffix == ".mcap" else CanLog(path, channels) as log:
+        put = log.can if isinstance(log, Recorder) else log.put
+        for ms in range(10):
+            for channel in channels:
+                put(channel, at(ms, ms, identifier=0x4E0 + int(channel[-1])))
+    return path
+
+
+def one_bus(channel: str) -> Settings:
+    return changed(load(CONFIG), {"buses.can0.channel": channel})
 
 
 def two_buses(folder: Path, left: str, right: str) -> Path:

@@ -1,13 +1,14 @@
 """What is published besides frames is in every export, by the same names."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from skin_host.cli import main
-from skin_host.errors import LogError
+from skin_host.errors import LogError, RequestError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.layout import load_skin
 from skin_host.mqtt.messages import encode_event
@@ -142,6 +143,21 @@ def test_nothing_of_an_earlier_export_stays_beside_a_new_one(
     export(series, tmp_path / "tables")
     export(Series(series.parts, [], {}), tmp_path / "tables")
     assert rows(tmp_path / "tables" / "slips.csv") == []
+
+
+def test_a_part_of_another_recording_does_not_stay_beside_a_new_export(
+    series: Series, tmp_path: Path
+) -> None:
+    (tmp_path / "load.csv").write_text("time_s,pressure_kpa\n")
+    export(series, tmp_path)
+    export(series, tmp_path)
+    (palm,) = series.parts.values()
+    other = replace(palm, name="forearm")
+    before = (tmp_path / "touches.csv").read_bytes()
+    with pytest.raises(RequestError, match=r"holds palm\.csv, a part that this recording does not"):
+        export(Series({"forearm": other}, [], {}), tmp_path)
+    assert (tmp_path / "touches.csv").read_bytes() == before
+    assert not (tmp_path / "forearm.csv").exists()
 
 
 def test_arrays(series: Series, tmp_path: Path) -> None:

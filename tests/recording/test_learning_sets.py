@@ -168,3 +168,18 @@ def test_episodes_of_another_data_set_are_neither_mixed_in_nor_replaced(tmp_path
         data_set(tmp_path, short)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     data_set(tmp_path, long)
+
+
+def test_a_data_set_is_replaced_by_its_own_recording_alone(tmp_path: Path) -> None:
+    palm = part("palm", range(0, 1000, 50))
+    data_set(tmp_path, palm)
+    first = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    for other in (part("palm", range(50, 1050, 50)), part("hand", range(0, 1000, 50))):
+        with pytest.raises(RequestError, match="not known to be of this recording"):
+            data_set(tmp_path, other)
+    assert first == {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    data_set(tmp_path, palm)
+    for content in ("{}", "[]", '{"skin": 1}', ""):
+        (tmp_path / "meta/info.json").write_text(content)
+        with pytest.raises(RequestError, match="not known to be of this recording"):
+            data_set(tmp_path, palm)

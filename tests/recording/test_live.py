@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from websockets.asyncio.client import connect
@@ -19,7 +20,7 @@ from websockets.typing import Subprotocol
 
 from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
-from skin_host.mqtt.info import node_info
+from skin_host.mqtt.info import PartInfo, node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.export import live
@@ -240,3 +241,41 @@ async def test_rerun_s_own_client_receives_points_contacts_and_transforms(
     assert {"Arrows3D:vectors", "Arrows3D:labels"} <= seen["/robot/left_hand/contacts"]
     assert "Transform3D:translation" in seen["/robot/left_forearm"]
     assert "Scalars:scalars" in seen["/kpa/left_hand"]
+
+
+async def test_taxels_are_shown_where_they_are_after_a_reload(mosquitto: Mosquitto) -> None:
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    info = node_info(layout, "main", version="1", configuration="x")
+    hand = info.parts["left_hand"]
+    moved = msgspec.structs.replace(
+        hand, position_m=[(x, y + 0.25, z) for x, y, z in hand.position_m]
+    )
+    n = layout.part("left_hand").n_taxels
+    none, kpa = np.zeros(n, np.bool_), np.zeros(n, np.float32)
+    frame = PressureFrame("left_hand", 1, 10**18, np.zeros(n, np.uint8), kpa, none, ~none, none)
+
+    def last(kind: type) -> Any:
+        return next((item for item in reversed(items) if isinstance(item, kind)), None)
+
+    def ys_m() -> list[float]:
+        return [] if last(Points) is None else last(Points).points["y"].tolist()
+
+    def wanted(shape: PartInfo) -> list[float]:
+        places = zip(shape.position_m, shape.pads, strict=True)
+        return np.array([y for (_, y, _), pad in places if pad == "pressure"], np.float32).tolist()
+
+    settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    async with Publisher(settings, "demo", "main") as robot:
+        robot.put_info(info)
+        async with following(mosquitto) as items:
+            for shape in (hand, moved):
+                robot.put_info(msgspec.structs.replace(info, parts={"left_hand": shape}))
+                while ys_m() != wanted(shape):
+                    frame = replace(frame, seq=frame.seq + 1, t_ns=frame.t_ns + 1)
+                    robot.put_frame(frame)
+                    robot.put_touch(TOUCH)
+                    await asyncio.sleep(0.05)
+            await until(lambda: last(Arrows) is not None and last(Arrows).arrows)
+            # Of a part that the robot has no longer nothing is left.
+            robot.put_info(msgspec.structs.replace(info, parts={"left_forearm": hand}))
+            await until(lambda: not last(Points).points["valid"].any() and not last(Arrows).arrows)

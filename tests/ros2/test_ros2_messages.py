@@ -7,6 +7,7 @@ ROS 2 sends messages with.
 import ast
 import importlib.util
 import json
+import math
 import re
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from tests.support.cdr import typestore
 ROS2 = Path(__file__).parents[2] / "ros2"
 NODE = (ROS2 / "skin_host_ros/skin_host_ros/node.py").read_text()
 T_NS = 1_700_000_000_123_456_789
+ON = Contact("arm", "ON")
 
 
 def module(path: Path) -> Any:
@@ -123,13 +125,13 @@ def test_a_point_cloud_has_a_row_a_taxel(made: Any, again: Callable[[Any], Any])
 
 
 def test_contacts_and_their_wrench(store: Any, made: Any, again: Callable[[Any], Any]) -> None:
-    seen = again(made.contacts(Contact("arm", "ON"), [TOUCH], T_NS))
+    seen = again(made.contacts(ON, [TOUCH], T_NS))
     (contact,) = seen.contacts
     assert (seen.state, seen.state) == (store.types["skin_host_msgs/msg/ContactArray"].ON, 1)
     assert (contact.id, contact.taxels.tolist(), contact.located) == (3, [0, 1], True)
     unknown = again(made.contacts(Contact("arm", "UNKNOWN", "offline"), [], T_NS))
     assert (unknown.state, unknown.why) == (2, "offline")
-    wrench = again(made.wrench("arm", [TOUCH], T_NS)).wrench
+    wrench = again(made.wrench(ON, [TOUCH], T_NS)).wrench
     assert wrench.force.z == -2.0  # into the skin
     assert wrench.torque.y == pytest.approx(0.2)
 
@@ -140,11 +142,48 @@ def test_the_wrench_on_a_fingertip_is_what_its_board_measures(
     """With the force along the surface, and of several contacts that have no one place."""
     load = Load("several_contacts", (0.5, 0.0, -2.0), (0.01, 0.0, 0.002), None, ["touch"])
     several = replace(TOUCH, centroid_m=None, normal=None, load=load)
-    wrench = again(made.wrench("index", [several], T_NS)).wrench
+    wrench = again(made.wrench(ON, [several], T_NS)).wrench
     assert (wrench.force.x, wrench.force.z) == (0.5, -2.0)
     assert (wrench.torque.x, wrench.torque.z) == (0.01, 0.002)
-    saturated = replace(several, load=replace(load, verdict="saturated"))
-    assert again(made.wrench("index", [saturated], T_NS)).wrench.force.z == 0.0
+    # Beyond its range it measures a bound, and not nothing.
+    saturated = replace(several, load=replace(load, verdict="saturated"), beyond=True)
+    assert again(made.wrench(ON, [saturated], T_NS)).wrench.force.z == -2.0
+    (contact,) = again(made.contacts(ON, [saturated], T_NS)).contacts
+    assert (contact.verdict, contact.beyond, contact.partial) == ("saturated", True, False)
+
+
+@pytest.mark.parametrize(
+    ("state", "force_n"), [("OFF", 0.0), ("ON", math.nan), ("UNKNOWN", math.nan)]
+)
+def test_wrench_is_0_only_where_nothing_touches(
+    made: Any, again: Callable[[Any], Any], state: Any, force_n: float
+) -> None:
+    wrench = again(made.wrench(Contact("arm", state), [], T_NS)).wrench
+    seen = [getattr(of, axis) for of in (wrench.force, wrench.torque) for axis in "xyz"]
+    np.testing.assert_array_equal(seen, [force_n] * 6)
+
+
+#: Fields of a touch that no message of ROS has, and why.
+LEFT_OUT = {
+    "event": "an array holds what lasts now",
+    "reason": "the same: an end is not in it, and an end that is none is in the state",
+    "seq": "the header has the time",
+    "t_ns": "the header has the time",
+    "count": "nothing is counted: the array is whole",
+    "missed": "the array is whole",
+    "sigma_m": "of the place alone",
+}
+#: Of a load; the wrench of the part has its force and torque.
+LEFT_OUT_OF_LOAD = {"force_n", "torque_nm", "shear_n", "flags"}
+
+
+def test_what_a_touch_has_is_passed_on_or_left_out_on_purpose(store: Any) -> None:
+    message = set(store.types["skin_host_msgs/msg/Contact"].__dataclass_fields__)
+    known = {"centroid_m": "centroid", "load": "verdict", "part": None}
+    for field in Touch.__struct_fields__:
+        name = known.get(field, field)
+        assert name is None or (name in message) is not (field in LEFT_OUT), field
+    assert {*Load.__struct_fields__} == LEFT_OUT_OF_LOAD | {"verdict"}
 
 
 def test_health_is_diagnostics(made: Any, again: Callable[[Any], Any]) -> None:
@@ -188,8 +227,8 @@ def test_other_processes_receive_the_same_bytes_over_dds(
             made.taxels(FRAME),
             made.layout("arm", SHAPE, T_NS),
             made.cloud(FRAME, SHAPE),
-            made.contacts(Contact("arm", "ON"), [TOUCH], T_NS),
-            made.wrench("arm", [TOUCH], T_NS),
+            made.contacts(ON, [TOUCH], T_NS),
+            made.wrench(ON, [TOUCH], T_NS),
             made.diagnostics({"arm": Health("arm", sick)}, T_NS),
         )
     }

@@ -1,6 +1,8 @@
 """What the ROS 2 node passes on, with stand-ins for ROS: rclpy is on no package index."""
 
 import importlib
+import math
+import runpy
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,11 +10,17 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from skin_host.client import Contact, Health
+from skin_host.client import Contact, Described, Frame, Health, PartInfo
 from skin_host.errors import BrokerError
+from skin_host.mqtt.topics import MAX_PART, wrong_part
 from skin_host.processing.events import Touch
+from tests.support.ros import check_topic
 from tests.support.said import touch_event
 
 PACKAGE = Path(__file__).parents[2] / "ros2" / "skin_host_ros"
@@ -33,6 +41,7 @@ class Node:
         return SimpleNamespace(value=default)
 
     def create_publisher(self, _kind: type, topic: str, _qos: object) -> Any:
+        check_topic(topic)
         return SimpleNamespace(publish=lambda message: self.published.append((topic, message)))
 
     def create_service(self, *_: object) -> None:
@@ -65,9 +74,18 @@ def node(module: ModuleType) -> Any:
     return made
 
 
-def touch(number: int, part: str = "arm", event: Any = "begin") -> Touch:
+def touch(number: int, part: str = "arm", event: Any = "begin", t_ns: int = 1) -> Touch:
     place: Any = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-    return touch_event(event, number, 1, 1, part, [0], *place, 50.0, 20.0, 10.0, 5.0)
+    return touch_event(event, number, 1, t_ns, part, [0], *place, 50.0, 20.0, 10.0, 5.0)
+
+
+def frame(part: str, t_ns: int) -> Frame:
+    one = np.zeros(1, np.bool_)
+    return Frame(part, 1, t_ns, np.zeros(1), ~one, one)
+
+
+def shape(x_m: float) -> PartInfo:
+    return PartInfo(50, ["pressure"], [(x_m, 0.0, 0.0)], [(0.0, 0.0, 1.0)], [2.0], [25.0], [])
 
 
 def last(node: Any, topic: str) -> Any:
@@ -83,8 +101,9 @@ def shown(node: Any) -> tuple[int, str, list[int], float]:
 def test_contacts_and_force_are_of_what_the_client_knows_to_be_there(node: Any) -> None:
     """Not of what a daemon reported that was started again since."""
     node._on_contact(Contact("arm", "ON"))
-    node.skin.present.return_value = [touch(3), touch(4, part="leg")]
+    node.skin.present.return_value = [touch(3)]
     node._on_touch(touch(3))
+    node.skin.present.assert_called_with("arm")
     assert shown(node) == (1, "", [3], -5.0)
     node.skin.present.return_value = [touch(1)]
     node._on_touch(touch(1))
@@ -105,9 +124,13 @@ def test_what_touched_before_is_not_known_of_a_part_that_is_not_received(
     node.skin.present.return_value = [touch(3)]
     node._on_touch(touch(3))
     assert shown(node) == (1, "", [3], -5.0)
+    node.skin.present.return_value = []  # the client knows that, too
     node._on_contact(Contact("arm", "UNKNOWN", why))
-    assert shown(node) == (2, why, [], 0.0)
+    state, reason, contacts, force_n = shown(node)
+    assert (state, reason, contacts) == (2, why, [])
+    assert math.isnan(force_n)  # 0 N would be known
     # It is received, but does not feel everywhere.
+    node.skin.present.return_value = [touch(3)]
     node._on_contact(Contact("arm", "UNKNOWN", "not_felt"))
     assert shown(node) == (2, "not_felt", [3], -5.0)
 
@@ -121,7 +144,89 @@ def test_a_contact_whose_end_was_lost_goes_with_the_next_health(node: Any) -> No
     assert len([topic for topic, _ in node.published if topic == "arm/wrench"]) == 2
     node.skin.present.return_value = []
     node._on_health(Health("arm", {"state": "ok"}))
-    assert shown(node) == (1, "", [], 0.0)
+    state, _, contacts, force_n = shown(node)
+    assert (state, contacts, math.isnan(force_n)) == (1, [], True)
+
+
+@pytest.mark.parametrize(
+    ("part", "name"),
+    [("left-hand", "left_hand"), ("2nd", "part_2nd"), ("-3", "_3"), ("arm", "arm")],
+)
+def test_every_name_of_a_part_is_one_of_ros(node: Any, part: str, name: str) -> None:
+    node._on_info(Described(part, "main", shape(0.0)))
+    node._on_frame(frame(part, 1))
+    node._on_contact(Contact(part, "OFF"))
+    topics = {f"{name}/{what}" for what in ("layout", "taxels", "points", "contacts", "wrench")}
+    assert {topic for topic, _ in node.published} == topics
+    # Frames keep the names that the parts have everywhere else.
+    assert {message.header.frame_id for _, message in node.published} == {part}
+
+
+@given(st.text(min_size=1, max_size=MAX_PART).filter(lambda name: wrong_part(name) is None))
+def test_whatever_a_part_may_be_called_ros_takes_it(name: str) -> None:
+    names = runpy.run_path(str(PACKAGE / "skin_host_ros" / "names.py"))
+    check_topic(f"{names['ros_name'](name)}/contacts")
+
+
+def test_two_parts_of_one_name_in_ros_end_it_with_one_line(
+    module: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    skin = MagicMock()
+    skin.return_value.parts.return_value = dict.fromkeys(["left-hand", "left_hand"])
+    monkeypatch.setattr(module, "SkinCallbacks", skin)
+    both = "skin: the parts left-hand and left_hand would both be left_hand in ROS"
+    with pytest.raises(SystemExit, match=both):
+        module.main()
+
+
+def test_a_part_may_take_the_name_in_ros_of_one_that_is_gone(node: Any) -> None:
+    node._on_info(Described("left-hand", "main", shape(0.0)))
+    node._on_info(Described("left-hand", "", None))
+    node._on_info(Described("left_hand", "main", shape(1.0)))
+    assert last(node, "left_hand/layout").header.frame_id == "left_hand"
+
+
+def test_taxels_are_where_the_newest_description_has_them(node: Any) -> None:
+    """Of a node that starts later, too, and after a change of the configuration."""
+    node.follow()
+    on_info = node.skin.on_info.call_args.args[0]
+    for x_m in (0.25, 0.5):
+        on_info(Described("arm", "main", shape(x_m)))
+        node._on_frame(frame("arm", 1))
+        assert last(node, "arm/layout").position[0].x == x_m
+        assert np.frombuffer(last(node, "arm/points").data, "<f4")[0] == x_m
+    on_info(Described("arm", "", None))
+    node.published.clear()
+    node._on_frame(frame("arm", 2))
+    assert [topic for topic, _ in node.published] == ["arm/taxels"]
+
+
+def stamps_ns(node: Any) -> list[int]:
+    times = [one.header.stamp for topic, one in node.published if topic == "arm/wrench"]
+    return [time.sec * 1_000_000_000 + time.nanosec for time in times]
+
+
+def test_stamps_are_times_of_the_robot_and_go_back_with_its_clock_only(node: Any) -> None:
+    """Also of states, which have no time of their own; none is of this computer's clock."""
+    second = 1_000_000_000
+    node._on_contact(Contact("arm", "UNKNOWN", "not_felt"))
+    node._on_frame(frame("arm", 100 * second))
+    node._on_contact(Contact("arm", "OFF"))
+    node._on_touch(touch(1, t_ns=100 * second - 1))  # the frame after it came first
+    node._on_touch(touch(1, t_ns=101 * second))
+    node._on_contact(Contact("arm", "ON"))
+    node._on_touch(touch(1, part="leg", t_ns=999 * second))
+    node._on_contact(Contact("arm", "UNKNOWN", "offline"))
+    node._on_frame(frame("arm", 50 * second))  # it was set back
+    node._on_contact(Contact("arm", "OFF"))
+    assert stamps_ns(node) == [second * s for s in (0, 100, 100, 101, 101, 101, 50)]
+
+
+def test_a_force_of_a_place_that_is_not_known_is_not_known(node: Any) -> None:
+    nowhere = replace(touch(3), centroid_m=None, normal=None)
+    node.skin.present.return_value = [touch(2), nowhere]
+    node._on_touch(nowhere)
+    assert math.isnan(last(node, "arm/wrench").wrench.force.z)
 
 
 def test_health_that_the_broker_has_stored_is_not_that_of_now(node: Any) -> None:

@@ -1,9 +1,10 @@
-"""A stand-in for the few names of ROS 2 that `examples/ros2_node.py` uses.
+"""Stand-ins for the few names of ROS 2 that `examples/ros2_node.py` and the node of `ros2/` use.
 
 rclpy comes with ROS 2 and with nothing else: it is on no package index. What is ours in the
-example is run with these; what ROS does with the messages is not tested here.
+programs is run with these; what ROS does with the messages is not tested here.
 """
 
+import re
 import sys
 import threading
 from types import ModuleType, SimpleNamespace
@@ -12,6 +13,14 @@ from typing import Any
 import pytest
 
 PATIENCE_S = 30.0
+
+
+def check_topic(topic: str) -> str:
+    """Refuse what rcl and rmw refuse of a topic without substitutions."""
+    levels = topic.removeprefix("/").split("/")
+    if len(topic) > 247 or not all(re.fullmatch("[A-Za-z_][A-Za-z0-9_]*", one) for one in levels):
+        raise ValueError(f"Invalid topic name: {topic}")
+    return topic
 
 
 class Vector3:
@@ -41,7 +50,7 @@ class Node:
         self.heard = threading.Event()
 
     def create_publisher(self, _kind: type, topic: str, qos_profile: int) -> Any:
-        self.made.append(topic)
+        self.made.append(check_topic(topic))
 
         def publish(message: Any) -> None:
             self.published.append((topic, message))
@@ -56,7 +65,7 @@ nodes: list[Node] = []
 
 def spin(node: Node) -> None:
     """Return once the node has published enough."""
-    assert node.heard.wait(PATIENCE_S)
+    assert not node.enough or node.heard.wait(PATIENCE_S)
 
 
 def install(monkeypatch: pytest.MonkeyPatch, enough: int) -> None:

@@ -6,9 +6,11 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from skin_host.client import Contact, Frame, Health, NodeInfo, PartInfo, Touch
 from skin_host.mqtt.info import FingertipInfo, TriangleInfo
+from skin_host.processing.events import Load
 from skin_host.viewer.picture import Cursor, Picture
 
 NOW_S = 100.0
@@ -63,9 +65,16 @@ def touch(event: Any, number: int, part: str = "palm", missed: int = 0) -> Touch
     )
 
 
+def take_nodes(skin: Picture, nodes: dict[str, tuple[bool | None, NodeInfo]]) -> None:
+    """Each part is of the last node that names it."""
+    infos = {name: one for name, (_, one) in nodes.items()}
+    holders = {part: name for name, one in infos.items() for part in [*one.parts, *one.fingertips]}
+    skin.take_nodes("test", {**nodes}, holders)
+
+
 def picture(parts: dict[str, int] | None = None) -> Picture:
     made = Picture()
-    made.take_nodes("test", {"main": (True, info(parts or {"palm": 3}))})
+    take_nodes(made, {"main": (True, info(parts or {"palm": 3}))})
     made.take_status({"connected": True})
     return made
 
@@ -75,6 +84,36 @@ def texts(news: list[bytes | str]) -> dict[str, Any]:
         message["type"]: message
         for message in (msgspec.json.decode(text) for text in news if isinstance(text, str))
     }
+
+
+#: Fields of a touch that a page is not sent, and why.
+LEFT_OUT = {
+    "event": "the list holds what lasts now",
+    "reason": "the same",
+    "seq": "of what lasts, the age is that of the part",
+    "t_ns": "the same",
+    "count": "the list is whole",
+    "missed": "the list is whole",
+    "normal": "not drawn",
+    "mean_kpa": "not shown: the highest is",
+    "sigma_m": "not drawn",
+}
+
+
+def test_what_a_touch_has_is_shown_or_left_out_on_purpose() -> None:
+    skin = picture()
+    skin.take_contact(Contact("palm", "ON"))
+    load = Load("saturated", (0.0, 0.0, -1.0), (0.0, 0.0, 0.0), None, [])
+    skin.take_touches([replace(touch("begin", 3), partial=True, beyond=True, load=load)])
+    message = texts(skin.news(Cursor(), NOW_S))["contacts"]
+    (contact,) = message["contacts"]
+    named = {"load": "verdict"}
+    sent = {named.get(field, field) for field in Touch.__struct_fields__ if field not in LEFT_OUT}
+    assert {*contact, "part"} == sent
+    assert (contact["partial"], contact["beyond"], contact["verdict"]) == (True, True, "saturated")
+    skin.take_touches([touch("begin", 3)])
+    (contact,) = texts(skin.news(Cursor(), NOW_S))["contacts"]["contacts"]
+    assert (contact["partial"], contact["beyond"], contact["verdict"]) == (False, False, None)
 
 
 def contact_ids(news: list[bytes | str]) -> list[int]:
@@ -182,7 +221,7 @@ def test_a_state_and_a_health_record_wait_for_the_description_of_their_part() ->
     skin = Picture()
     skin.take_contact(Contact("palm", "UNKNOWN", "offline"))
     skin.take_health(Health("palm", {"state": "ok", "valid_taxels": 3}), NOW_S)
-    skin.take_nodes("test", {"main": (False, info({"palm": 3}))})
+    take_nodes(skin, {"main": (False, info({"palm": 3}))})
     sent = texts(skin.news(Cursor(), NOW_S + 30.0))
     assert (sent["contacts"]["state"], sent["contacts"]["why"]) == ("UNKNOWN", "offline")
     assert (sent["health"]["valid_taxels"], sent["health"]["age_s"]) == (3, 30.0)
@@ -226,7 +265,7 @@ def test_a_changed_layout_is_told_with_all_that_is_known() -> None:
     skin.take_frame(frame("palm", [1, 2, 3]), NOW_S)
     skin.news(cursor, NOW_S)
     both = {"main": (True, info({"palm": 3})), "legs": (True, info({"foot": 2}, "legs"))}
-    skin.take_nodes("test", both)
+    take_nodes(skin, both)
     news = skin.news(cursor, NOW_S)
     layout = texts(news)["layout"]
     assert [(part["name"], part["node"]) for part in layout["parts"]] == [
@@ -234,8 +273,37 @@ def test_a_changed_layout_is_told_with_all_that_is_known() -> None:
         ("foot", "legs"),
     ]
     assert sum(isinstance(message, bytes) for message in news) == 1
-    skin.take_nodes("test", both)
+    take_nodes(skin, both)
     assert skin.news(cursor, NOW_S) == []
+
+
+def test_a_part_is_drawn_once_by_the_description_of_the_node_that_has_it() -> None:
+    """Of one that has moved between nodes, or between a part of skin and a fingertip, the former
+    node's description stays at the broker.
+    """
+    tip = FingertipInfo(3, "sphere", [7.0], None, None, 0.1, 10.0)
+    former = msgspec.structs.replace(info({"palm": 2, "tip": 4}, "former"), fingertips={})
+    now = msgspec.structs.replace(info({"palm": 3}, "now"), fingertips={"tip": tip})
+    nodes: dict[str, tuple[bool | None, NodeInfo | None]] = {
+        "now": (True, now),
+        "former": (False, former),
+    }
+    for _ in range(2):  # in whichever order they came
+        skin = Picture()
+        cursor = Cursor()
+        skin.take_nodes("test", nodes, {"palm": "now", "tip": "now"})
+        parts = texts(skin.news(cursor, NOW_S))["layout"]["parts"]
+        assert [(part["name"], part["node"], len(part["pads"])) for part in parts] == [
+            ("palm", "now", 3),
+            ("tip", "now", 0),
+        ]
+        skin.take_nodes("test", nodes, {"palm": "former", "tip": "now"})
+        parts = texts(skin.news(cursor, NOW_S))["layout"]["parts"]
+        assert [(part["name"], part["node"], len(part["pads"])) for part in parts] == [
+            ("palm", "former", 2),
+            ("tip", "now", 0),
+        ]
+        nodes = dict(reversed(nodes.items()))
 
 
 def test_health_is_told_in_sentences() -> None:
@@ -263,7 +331,7 @@ def test_nodes_that_go_offline_are_told() -> None:
     skin = picture()
     cursor = Cursor()
     assert texts(skin.news(cursor, NOW_S))["status"]["nodes"] == {"main": True}
-    skin.take_nodes("test", {"main": (False, info({"palm": 3}))})
+    take_nodes(skin, {"main": (False, info({"palm": 3}))})
     skin.take_status({"connected": True})
     assert texts(skin.news(cursor, NOW_S))["status"]["nodes"] == {"main": False}
 
@@ -272,7 +340,7 @@ def test_a_fingertip_without_skin_is_told_with_its_contacts_and_health() -> None
     tip = FingertipInfo(3, "sphere", [7.0], None, None, 0.1, 10.0)
     other = msgspec.structs.replace(info({"back": 2}, "two"), fingertips={"tip": tip})
     skin = picture()
-    skin.take_nodes("test", {"two": (True, other), "main": (True, info({"palm": 3}))})
+    take_nodes(skin, {"two": (True, other), "main": (True, info({"palm": 3}))})
     skin.take_touches([msgspec.structs.replace(touch("begin", 4, "tip"), taxels=[], peak_kpa=None)])
     skin.take_contact(Contact("tip", "ON"))
     skin.take_health(Health("tip", {"state": "saturated", "rate_hz": 333.0}), NOW_S)

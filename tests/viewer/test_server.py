@@ -269,6 +269,7 @@ async def test_the_page_may_calibrate(mosquitto: Mosquitto) -> None:
         told = await heard(socket, of_type("answer"))
         assert not told["ok"]
         assert "no raw here" in told["error"]
+        assert (told["do"], told["node"]) == ("raw", "main")
 
 
 async def test_a_part_alone_is_calibrated(mosquitto: Mosquitto) -> None:

@@ -94,24 +94,28 @@ class Messages:
             is_dense=bool(frame.valid.all()),
         )
 
-    def wrench(self, part: str, touches: Sequence[Touch], t_ns: int) -> Any:
+    def wrench(self, contact: Contact, touches: Sequence[Touch], t_ns: int) -> Any:
         """geometry_msgs/WrenchStamped: what all contacts do to the part, in its frame.
 
-        Of a fingertip on a force/torque board this is measured; of skin it is known of contacts
-        with a place.
+        Of a fingertip on a force/torque board this is measured, and a bound where the board is
+        saturated. It is NaN where it is not known: nothing is known to touch a part that is not
+        known to be untouched, or a contact of skin has no place.
         """
         force, torque = np.zeros(3), np.zeros(3)
+        if not touches and contact.touched:
+            force, torque = np.full(3, np.nan), np.full(3, np.nan)
         for touch in touches:
             if touch.load is not None:
-                if touch.load.verdict != "saturated":
-                    force += touch.load.force_n
-                    torque += touch.load.torque_nm
-            elif touch.centroid_m is not None and touch.normal is not None:
+                force += touch.load.force_n
+                torque += touch.load.torque_nm
+            elif touch.centroid_m is None or touch.normal is None:
+                force, torque = np.full(3, np.nan), np.full(3, np.nan)
+            else:
                 one = -touch.force_n * np.array(touch.normal)
                 force += one
                 torque += np.cross(touch.centroid_m, one)
         return self._types("geometry_msgs/msg/WrenchStamped")(
-            header=self.header(part, t_ns),
+            header=self.header(contact.part, t_ns),
             wrench=self._types("geometry_msgs/msg/Wrench")(
                 force=self._vector(force.tolist()), torque=self._vector(torque.tolist())
             ),
@@ -151,6 +155,9 @@ class Messages:
             peak_kpa=nothing if touch.peak_kpa is None else touch.peak_kpa,
             mean_kpa=nothing if touch.mean_kpa is None else touch.mean_kpa,
             area_mm2=nothing if touch.area_mm2 is None else touch.area_mm2,
+            partial=touch.partial,
+            beyond=touch.beyond,
+            verdict="" if touch.load is None else touch.load.verdict,
         )
 
     def _point(self, place: Sequence[float]) -> Any:

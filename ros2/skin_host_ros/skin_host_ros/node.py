@@ -1,4 +1,5 @@
-"""The node. Topics of a part: `<part>/taxels`, `/layout`, `/points`, `/contacts`, `/wrench`.
+"""The node. Topics of a part: `<part>/taxels`, `/layout`, `/points`, `/contacts`, `/wrench`,
+where `<part>` is its name as ROS takes it.
 
 `/diagnostics` has the health of all parts, the service `calibrate` calibrates untouched skin.
 """
@@ -22,9 +23,22 @@ from sensor_msgs.msg import PointCloud2
 from skin_host_msgs.msg import ContactArray, TaxelArray, TaxelLayout
 from skin_host_msgs.srv import Calibrate
 
-from skin_host.client import Contact, Frame, Health, PartInfo, SkinCallbacks, SkinError, Touch
-from skin_host_ros.messages import Messages
+from skin_host.client import (
+    Contact,
+    Described,
+    Frame,
+    Health,
+    PartInfo,
+    RequestError,
+    SkinCallbacks,
+    SkinError,
+    Touch,
+)
+from skin_host_ros.messages import NS, Messages
+from skin_host_ros.names import ros_name
 
+#: What is further back is the time of a robot whose clock was set back.
+SET_BACK_NS = NS
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RELIABLE = QoSProfile(depth=100)
 
@@ -49,71 +63,108 @@ class SkinNode(Node):
         url = self.declare_parameter("broker", "mqtt://localhost").value
         robot = self.declare_parameter("robot", "").value or None
         self._messages = Messages(message_class, message_array, lambda level: bytes([level]))
+        #: By name in topics: the part that has it.
+        self._named: dict[str, str] = {}
+        self._shapes: dict[str, PartInfo] = {}
+        #: By part: the newest time that came of it, by the robot's clock.
+        self._newest_ns: dict[str, int] = {}
         self._states: dict[str, Contact] = {}
         #: By part: the contacts that were published last, as touches.
         self._shown: dict[str, list[Touch]] = {}
         self._publisher = cache(self._new_publisher)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         self.skin = SkinCallbacks(url, robot=robot)
-        self._parts: dict[str, PartInfo] = {}
         self.create_service(Calibrate, "calibrate", self._calibrate)
 
     def _new_publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
         return self.create_publisher(kind, topic, qos)
 
+    def _publish(self, part: str, what: str, kind: type, qos: QoSProfile, message: Any) -> None:
+        self._publisher(kind, f"{self._name(part)}/{what}", qos).publish(message)
+
+    def _name(self, part: str) -> str:
+        """Return a part's name in topics.
+
+        Raises:
+            RequestError: another part has it.
+        """
+        name = ros_name(part)
+        other = self._named.setdefault(name, part)
+        if other != part:
+            raise RequestError(
+                f"the parts {other} and {part} would both be {name} in ROS; rename one of them"
+            )
+        return name
+
     def follow(self) -> None:
-        """Publish where the taxels of all parts are, and from now on what is received."""
-        for info in self.skin.info().values():
-            for part, shape in info.parts.items():
-                self._parts[part] = shape
-                layout = self._messages.layout(part, shape, time.time_ns())
-                self._publisher(TaxelLayout, f"{part}/layout", KEPT).publish(layout)
+        """Publish from now on where the taxels of all parts are, and what is received.
+
+        Raises:
+            BrokerError: no node published its info.
+            RequestError: two parts would have one name in ROS.
+        """
+        self.skin.info()
+        for part in self.skin.parts():
+            self._name(part)
         # They are called one after the other in the client's thread.
+        self.skin.on_info(self._on_info)
         self.skin.on_frame(self._on_frame)
         self.skin.on_touch(self._on_touch)
         self.skin.on_contact(self._on_contact)
         self.skin.on_health(self._on_health)
 
+    def _on_info(self, described: Described) -> None:
+        part, shape = described.part, described.skin
+        self._shapes.pop(part, None)
+        if described.info is None and self._named.get(ros_name(part)) == part:
+            del self._named[ros_name(part)]
+        if shape is not None:
+            self._shapes[part] = shape
+            layout = self._messages.layout(part, shape, time.time_ns())
+            self._publish(part, "layout", TaxelLayout, KEPT, layout)
+
     def _on_frame(self, frame: Frame) -> None:
-        taxels = self._publisher(TaxelArray, f"{frame.part}/taxels", qos_profile_sensor_data)
-        taxels.publish(self._messages.taxels(frame))
-        shape = self._parts.get(frame.part)
+        part, shape = frame.part, self._shapes.get(frame.part)
+        self._note_time(part, frame.t_ns)
+        taxels = self._messages.taxels(frame)
+        self._publish(part, "taxels", TaxelArray, qos_profile_sensor_data, taxels)
         if shape is not None and len(shape.pads) == len(frame.valid):
-            points = self._publisher(PointCloud2, f"{frame.part}/points", qos_profile_sensor_data)
-            points.publish(self._messages.cloud(frame, shape))
+            points = self._messages.cloud(frame, shape)
+            self._publish(part, "points", PointCloud2, qos_profile_sensor_data, points)
+
+    def _note_time(self, part: str, t_ns: int) -> None:
+        """Take the time of a frame or touch; they come in nearly the order of their times."""
+        if not 0 < self._newest_ns.get(part, 0) - t_ns < SET_BACK_NS:
+            self._newest_ns[part] = t_ns
 
     def _on_touch(self, touch: Touch) -> None:
-        self._publish_contacts(touch.part, touch.t_ns)
+        self._note_time(touch.part, touch.t_ns)
+        self._publish_contacts(touch.part)
 
     def _on_contact(self, contact: Contact) -> None:
         self._states[contact.part] = contact
-        self._publish_contacts(contact.part, time.time_ns())
+        self._publish_contacts(contact.part)
 
-    def _known_touches(self, part: str) -> list[Touch]:
-        """What touches a part. Of one that is not received nothing is known, nor what it does."""
-        known = self._states.get(part)
-        if known is not None and known.why not in (None, "not_felt"):
-            return []
-        return [touch for touch in self.skin.present() if touch.part == part]
-
-    def _publish_contacts(self, part: str, t_ns: int) -> None:
-        touches = self._shown[part] = self._known_touches(part)
+    def _publish_contacts(self, part: str) -> None:
+        """Publish what touches a part, as of the newest time that is known of it."""
+        touches = self._shown[part] = self.skin.present(part)
         known = self._states.get(part)
         # A touch may come before the state that it makes.
         if touches and (known is None or known.state == "OFF"):
             known = Contact(part, "ON")
         state = known or Contact(part, "UNKNOWN", "stale")
+        t_ns = self._newest_ns.get(part, 0)
         contacts = self._messages.contacts(state, touches, t_ns)
-        self._publisher(ContactArray, f"{part}/contacts", RELIABLE).publish(contacts)
-        wrench = self._messages.wrench(part, touches, t_ns)
-        self._publisher(WrenchStamped, f"{part}/wrench", RELIABLE).publish(wrench)
+        self._publish(part, "contacts", ContactArray, RELIABLE, contacts)
+        wrench = self._messages.wrench(state, touches, t_ns)
+        self._publish(part, "wrench", WrenchStamped, RELIABLE, wrench)
 
     def _on_health(self, health: Health) -> None:
         if health.stored:
             return  # it may be from any time, and shows nothing of now
         # A contact whose end was lost goes without a message.
-        if self._known_touches(health.part) != self._shown.get(health.part, []):
-            self._publish_contacts(health.part, time.time_ns())
+        if self.skin.present(health.part) != self._shown.get(health.part, []):
+            self._publish_contacts(health.part)
         one = self._messages.diagnostics({health.part: health}, time.time_ns())
         self._diagnostics.publish(one)
 

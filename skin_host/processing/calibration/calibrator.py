@@ -59,6 +59,14 @@ SURE_DEVIATIONS = 6.0
 #: ... and they rise and fall once, or together with another taxel of the triangle.
 PRESS_SWITCHES = 2
 SHARED_CORRELATION = 0.8
+#: A part was pressed as a whole if the mean of its pads moves by more than this, the least
+#: threshold of a touch, five standard errors, and the fastest drift, and this share of them moves
+#: like it.
+COMMON_UNITS = 1.0
+DRIFT_UNITS_PER_S = 0.1
+COMMON_SHARE = 0.5
+#: A pad moves like the mean if their correlation is beyond so many standard errors.
+ALIKE_ERRORS = 2.0
 #: A taxel that rests this much nearer to pressure than its triangle and its part was pressed, if
 #: its noise does not explain it.
 PRESSED_UNITS = 8.0
@@ -138,6 +146,8 @@ class Calibrator:
         self._times_off = np.zeros(n, np.int64)
         self._conversions = [Conversions(part.n_taxels) for part in layout.parts]
         self._at_ns: list[int | None] = [None] * len(layout.parts)
+        #: How long each part was added.
+        self._passed_s = [0.0] * len(layout.parts)
 
     def add(
         self,
@@ -164,6 +174,7 @@ class Calibrator:
         if t_ns is not None:
             before, self._at_ns[part_index] = self._at_ns[part_index], t_ns
             dt_s = 0.0 if before is None else max((t_ns - before) * 1e-9, 0.0)
+            self._passed_s[part_index] += dt_s
             repeated = self._conversions[part_index].step(raw.copy(), dt_s)
             new = present if repeated is None else present & ~repeated
         self._counts[taxels[new], raw[new]] += 1
@@ -217,7 +228,7 @@ class Calibrator:
             # Neighbouring blocks do not show noise that wanders for seconds, or seldom jumps.
             expected = before.noise * np.sqrt(repeats / course.length)
             error = np.where(before.usable, np.fmax(error, expected), error)
-        touched = self._touched(variance, repeats, error)
+        touched = self._touched(variance, repeats, error) | self._pressed_together()
         steady_noise = steady * np.sqrt(course.length * samples / np.maximum(received, 1))
         # The lowest activation is the untouched one. The lowest mean alone would be too low by what
         # noise took it down: the fewer measurements a mean has, the more.
@@ -256,6 +267,8 @@ class Calibrator:
         few = (received < FEWEST_SAMPLES) | self._froze(variance)
         uncertain = spread > ERROR_SHARE * touch.enter * np.sqrt(some)
         few |= (unknown | uncertain) & (verdict < Verdict.STUCK)
+        # Neither is a share of few samples known.
+        few |= unknown & (verdict == Verdict.OUT_OF_RANGE)
         verdict[few] = Verdict.TOO_FEW
         verdict[received == 0] = Verdict.ABSENT
         # What a few bytes scatter by is not their noise: too little would call it damaged later.
@@ -274,7 +287,7 @@ class Calibrator:
             verdict=verdict,
             damaged=damaged,
         )
-        return identified(found if known is None else _going_on(found, known, few))
+        return identified(found) if known is None else going_on(found, known)
 
     def _note_off(self, taxels: NDArray[np.intp], raw: NDArray[np.uint8]) -> None:
         """Note which bytes the new ones [m] show to have been off alone: mostly the last ones."""
@@ -414,6 +427,38 @@ class Calibrator:
                 pressed[taxel] |= shared > SHARED_CORRELATION
         return pressed
 
+    def _pressed_together(self) -> Mask:
+        """Return the taxels [n] of parts that were pressed as a whole for a part of the time.
+
+        The noise of each may hide a slow press, as of air in a chamber, that together they show.
+        """
+        course, layout = self._course, self._layout
+        found = np.zeros(len(self._received), np.bool_)
+        pressure = np.flatnonzero(layout.pad_kind == PadKind.PRESSURE)
+        for part, passed_s in zip(layout.parts, self._passed_s, strict=True):
+            pads = pressure[(pressure >= part.start) & (pressure < part.stop)]
+            number = int(course.number[pads].max(initial=0)) // JOINED * JOINED
+            pads = pads[course.number[pads] >= number]
+            if number < FEWEST_BLOCKS * JOINED:
+                continue
+            each = course.means[pads, :number]
+            each = each - each.mean(axis=1, keepdims=True)
+            lively = each.any(axis=1)
+            pads, each = pads[lively], each[lively]
+            if not len(pads):
+                continue
+            shared = each.mean(axis=0)
+            # Second differences, because a steady rise is no noise.
+            step = float(np.median(np.abs(np.diff(shared, 2)))) / (0.6745 * np.sqrt(6.0))
+            error = step / np.sqrt(JOINED)
+            limit = max(COMMON_UNITS, STEADY_ERRORS * error, DRIFT_UNITS_PER_S * passed_s)
+            if np.ptp(shared.reshape(-1, JOINED).mean(axis=1)) <= limit:
+                continue
+            likeness = each @ shared / np.sqrt(np.sum(each**2, axis=1) * np.sum(shared**2))
+            alike = likeness > ALIKE_ERRORS / np.sqrt(number)
+            found[pads] = alike & (alike.mean() >= COMMON_SHARE)
+        return found
+
     def _pressed(self, baseline: Floats, counts: NDArray[np.int64], within: Mask) -> Mask:
         """Return the taxels [n] that were pressed all the time: they rest far from all other
         pads that are within the scale.
@@ -496,19 +541,23 @@ def _underestimated(samples: NDArray[np.int64]) -> Floats:
     return found
 
 
-def _going_on(found: Calibration, known: Known, few: Mask) -> Calibration:
-    """Return a calibration in which the taxels `few` [n] have what is known of them, if it is."""
+def going_on(found: Calibration, known: Known) -> Calibration:
+    """Return a calibration in which taxels of which too little was received have what is known of
+    them, if their zero is not in doubt and they were usable.
+    """
     before = known.calibration
-    unchanged = few & known.zeroed & before.usable
+    unchanged = (found.verdict >= Verdict.ABSENT) & known.zeroed & before.usable
     above = before.percentile - before.baseline
-    return replace(
-        found,
-        baseline=np.where(unchanged, known.baseline, found.baseline),
-        percentile=np.where(unchanged, known.baseline + above, found.percentile),
-        noise=np.where(unchanged, before.noise, found.noise),
-        spread=np.where(unchanged, before.spread, found.spread),
-        verdict=np.where(unchanged, before.verdict, found.verdict),
-        unchanged=unchanged,
+    return identified(
+        replace(
+            found,
+            baseline=np.where(unchanged, known.baseline, found.baseline),
+            percentile=np.where(unchanged, known.baseline + above, found.percentile),
+            noise=np.where(unchanged, before.noise, found.noise),
+            spread=np.where(unchanged, before.spread, found.spread),
+            verdict=np.where(unchanged, before.verdict, found.verdict),
+            unchanged=unchanged,
+        )
     )
 
 

@@ -17,7 +17,6 @@ from skin_host.processing.calibration import (
     Floats,
     Verdict,
     Zero,
-    with_pressures_of,
 )
 from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory, rising
 from skin_host.processing.touch import levels
@@ -331,16 +330,3 @@ def _curves_of(
         content.lag_s,
         Memory(tuple(content.radius_kpa), tuple(content.weight)),
     )
-
-
-def with_gains_of(calibration: Calibration, path: Path, layout: Layout) -> Calibration:
-    """Return the calibration with gains and curves of the one in `path`, if one fits.
-
-    Zero and noise are measured at every start; gains and curves belong to pad and foam, and remain
-    valid.
-
-    Raises:
-        NewerFileError, BusyFileError: see `find_calibration`.
-    """
-    before = find_calibration(path, layout, calibration.configuration)
-    return calibration if before is None else with_pressures_of(calibration, before)

@@ -11,7 +11,6 @@ pads on denser foam differ little at low pressure and much at high pressure.
 """
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +24,12 @@ from skin_host.processing.curves import (
     Memory,
     TableCurve,
     rising,
+)
+from skin_host.processing.fitting.memory import (
+    UNCERTAINTY_KPA,
+    fit_memory,
+    hinges,
+    loading_kpa,
 )
 from skin_host.processing.relaxation import PlayRelaxation
 from skin_host.processing.smoothing import LIMIT_DEVIATIONS, StepFilter
@@ -44,6 +49,9 @@ LEAST_UNITS = 3.0
 #: Quantiles of a pad's activations that represent rest and press.
 PRESSED_QUANTILES = (0.02, 0.98)
 LEAST_CORRELATION = 0.8
+#: Pads of one foam differ by less than this factor (as `GAIN_RANGE`): where the median pad that
+#: follows moves this much more than the least, one that does not is dead.
+WEAKEST = 5.0
 #: If the pads' median correlates less than this with the table, the table does not belong to the
 #: recording.
 SAME_CORRELATION = 0.9
@@ -52,8 +60,7 @@ LONGEST_LAG_S = 60.0
 LAG_STEP_S = 0.05
 #: A course must span this pressure; otherwise it is in another unit or nothing is pressed.
 LEAST_KPA = 10.0
-#: Uncertainty of the pressure itself, and its possible time shift against the pads while it moves.
-UNCERTAINTY_KPA = 2.0
+#: Possible time shift of the pressure against the pads while it moves.
 DOUBT_S = 0.7
 #: A pad jumps if it changes by this much, and this multiple of its noise, within half a second
 #: beyond twice what the pressure explains.
@@ -63,19 +70,11 @@ JUMP_DEVIATIONS = 3.0
 #: pressed.
 PRESSED_RAIL_SHARE = 0.005
 RESTING_RAIL_SHARE = 0.05
-#: A pad is noisy if its error is above this share of the highest pressure, and above this pressure.
-NOISY_SHARE = 0.035
+#: A pad is noisy if its error is above this pressure, and above that of so many of its units: that
+#: is where a touch ends, so it could not be parted from rest. How high the course goes is no
+#: matter.
+NOISY_UNITS = 1.5
 NOISY_KPA = 4.0
-#: Radii of plays to try, as shares of the highest pressure, and how many at most. One more is used
-#: if it lowers the square error on data that was not fitted by this share. Each has at least the
-#: least weight, together they stay below the most.
-RADII = (0.015, 0.03, 0.06, 0.12, 0.24)
-MOST_PLAYS = 3
-WORTH_SHARE = 0.1
-LEAST_WEIGHT = 0.01
-MOST_WEIGHT = 0.5
-#: The recording is cut into this many pieces; each fit leaves one of them out.
-FOLDS = 8
 #: Samples at this distance are independent enough to be fitted.
 FIT_STEP_S = 0.1
 #: Weight of a curve's bends, relative to its mean slope.
@@ -127,14 +126,8 @@ def fit_course(course: Course, smoothing_s: float, memory: Memory | None = None)
     n = course.raw.shape[1]
     units, saturates = activations(course)
     noise = _noise(units, course.dt_s)
-    verdict = np.full(n, CurveVerdict.UNKNOWN, np.uint8)
     pressure = course.pressure_kpa
-    follows = following(units, pressure, course.dt_s)
-    verdict[course.there] = CurveVerdict.DEAD
-    verdict[course.there & follows] = CurveVerdict.GOOD
-    jumps = _jumps(units, pressure, noise, course.dt_s)
-    verdict[course.there & jumps] = CurveVerdict.JUMPS
-    verdict[course.there & saturates] = CurveVerdict.SATURATES
+    verdict = _first_verdict(course, units, noise, saturates)
     good = np.flatnonzero(verdict == CurveVerdict.GOOD)
     if not len(good):
         raise RequestError("no pad follows the pressure without jumps; wanted all pads pressed")
@@ -145,8 +138,8 @@ def fit_course(course: Course, smoothing_s: float, memory: Memory | None = None)
     # What is smoothed lags behind by up to the filter's limit, as the foam does by its memory.
     median = np.median(units[:, good], axis=1)
     if memory is None:
-        memory = _fit_memory(median[thin], pressure[thin], weight, highest_kpa)
-    loading = _loading_kpa(pressure, memory)[thin]
+        memory = fit_memory(median[thin], pressure[thin], weight)
+    loading = loading_kpa(pressure, memory)[thin]
     kpa = np.zeros((n, len(KNOTS_UNITS)))
     beyond = np.full(n, np.inf)
     for column, pad in enumerate(good):
@@ -157,9 +150,42 @@ def fit_course(course: Course, smoothing_s: float, memory: Memory | None = None)
     found = Curves(rising(kpa), beyond, noise, error, verdict, highest_kpa, course.lag_s, memory)
     read = read_course(found, good, units[:, good], smoothing_s, course.dt_s)
     error[good] = np.sqrt(np.mean((read - pressure[:, np.newaxis]) ** 2, axis=0))
-    noisy = error > max(NOISY_SHARE * highest_kpa, NOISY_KPA)
-    verdict[noisy] = CurveVerdict.NOISY
+    unit_kpa = mean_slope(TableCurve(found.kpa, beyond))
+    verdict[error > np.maximum(NOISY_UNITS * unit_kpa, NOISY_KPA)] = CurveVerdict.NOISY
     return replace(found, verdict=verdict)
+
+
+def shown(course: Course) -> Mask:
+    """Return the pads [n] of which a course shows a curve, or that they have none.
+
+    Of the others nothing is known afterwards either: see `fit_course`.
+    """
+    units, saturates = activations(course)
+    verdict = _first_verdict(course, units, _noise(units, course.dt_s), saturates)
+    found: Mask = verdict != CurveVerdict.UNKNOWN
+    return found
+
+
+def _first_verdict(
+    course: Course, units: Floats, noise: Floats, saturates: Mask
+) -> NDArray[np.uint8]:
+    """Return verdicts [n] before a curve is fitted.
+
+    A pad that does not follow is dead only if the weakest would have followed, and otherwise noisy
+    if its noise hides the least response.
+    """
+    follows = course.there & following(units, course.pressure_kpa, course.dt_s)
+    moved = _span(units[:, follows], course.dt_s)
+    strong = moved.size > 0 and float(np.median(moved)) >= WEAKEST * LEAST_UNITS
+    verdict = np.full(len(follows), CurveVerdict.UNKNOWN, np.uint8)
+    verdict[course.there & (noise > LEAST_UNITS)] = CurveVerdict.NOISY
+    if strong:
+        verdict[course.there] = CurveVerdict.DEAD
+    verdict[follows] = CurveVerdict.GOOD
+    jumps = _jumps(units, course.pressure_kpa, noise, course.dt_s)
+    verdict[course.there & jumps] = CurveVerdict.JUMPS
+    verdict[course.there & saturates] = CurveVerdict.SATURATES
+    return verdict
 
 
 def activations(course: Course) -> tuple[Floats, Mask]:
@@ -196,11 +222,16 @@ def read_course(
 
 def limit_kpa(curve: Curve, noise_units: Floats) -> Floats:
     """Return the effect of noise [n] in the middle of the measured range, for `StepFilter`."""
+    limit: Floats = LIMIT_DEVIATIONS * noise_units * mean_slope(curve)
+    return limit
+
+
+def mean_slope(curve: Curve) -> Floats:
+    """Return the pressure of one unit [n], kPa, in the mean over the measured range."""
     end = np.where(np.isfinite(curve.beyond_units), curve.beyond_units, 1.0)
     end = np.maximum(end, 1.0)
-    slope = curve.kpa(end) / end
-    limit: Floats = LIMIT_DEVIATIONS * noise_units * slope
-    return limit
+    slope: Floats = curve.kpa(end) / end
+    return slope
 
 
 def make_memory(n: int, memory: Memory, dtype: type = np.float64) -> PlayRelaxation | None:
@@ -235,7 +266,7 @@ def find_lag(median_units: Floats, time_s: Floats, table: tuple[Floats, Floats])
         )
     fine = np.arange(time_s[0], time_s[-1], FIT_STEP_S)
     units = np.interp(fine, time_s, median_units)
-    basis = np.hstack([_hinges(units), _lagging(units)])
+    basis = np.hstack([hinges(units), _lagging(units)])
     # One pseudo-inverse for all lags: only the right-hand side differs.
     project = np.linalg.pinv(basis)
     tried = near + np.arange(-2.0, 2.0 + 0.5 * LAG_STEP_S, LAG_STEP_S)
@@ -264,18 +295,16 @@ def median_of_moving(units: Floats, dt_s: float) -> Floats:
 
 def moves(units: Floats, dt_s: float, between: tuple[float, float]) -> Mask:
     """Return which pads [n] have activations [t, n] that differ between these two quantiles."""
-    blocks = _block_means(units, max(round(BLOCK_S / dt_s), 1))
-    low, high = np.quantile(blocks, between, axis=0)
-    moving: Mask = high - low > LEAST_UNITS
+    moving: Mask = _span(units, dt_s, between) > LEAST_UNITS
     return moving
 
 
-def _hinges(units: Floats) -> Floats:
-    """A piecewise linear basis [t, k] over an activation [t]."""
-    top = float(np.max(units))
-    knots = np.linspace(0.0, max(top, 1.0), 9)[:-1]
-    columns = [np.ones_like(units), units, *(np.maximum(units - knot, 0.0) for knot in knots[1:])]
-    return np.stack(columns, axis=1)
+def _span(units: Floats, dt_s: float, between: tuple[float, float] = PRESSED_QUANTILES) -> Floats:
+    """Return how far these quantiles of activations [t, n] are apart [n]."""
+    blocks = _block_means(units, max(round(BLOCK_S / dt_s), 1))
+    low, high = np.quantile(blocks, between, axis=0)
+    span: Floats = high - low
+    return span
 
 
 def _lagging(units: Floats) -> Floats:
@@ -340,108 +369,6 @@ def _weight(pressure: Floats, dt_s: float) -> Floats:
     rate = np.gradient(smooth)[length:-length] / dt_s
     weight: Floats = 1.0 / (UNCERTAINTY_KPA**2 + (DOUBT_S * rate) ** 2)
     return weight
-
-
-def _fit_memory(units: Floats, pressure: Floats, weight: Floats, highest_kpa: float) -> Memory:
-    """Return as many plays as lower the error on data that was not fitted.
-
-    As plays of the pressure they enter the reading linearly: f(x) = P + sum v (p - max(P - rho,
-    0)).
-    The compensator's plays, of the reading, are those of the inverse operator.
-    """
-    wanted = np.maximum(pressure, 0.0)
-    lags = {share: _play_lag(wanted, share * highest_kpa) for share in RADII}
-    hinges = _hinges(units)
-    root = np.sqrt(weight)[:, np.newaxis]
-    piece = np.arange(len(units)) * 4 * FOLDS // len(units) % FOLDS
-
-    def fitted(shares: list[float], kept: Mask) -> Floats | None:
-        """Return coefficients of hinges and plays; None if no foam has such plays."""
-        basis = np.hstack([hinges, *(-lags[share][:, np.newaxis] for share in shares)])
-        found = np.linalg.lstsq((root * basis)[kept], (root[:, 0] * wanted)[kept], rcond=None)[0]
-        plays = found[hinges.shape[1] :]
-        return None if np.any(plays < LEAST_WEIGHT) or np.sum(plays) >= MOST_WEIGHT else found
-
-    def held_out(shares: list[float]) -> float:
-        basis = np.hstack([hinges, *(-lags[share][:, np.newaxis] for share in shares)])
-        total = 0.0
-        for fold in range(FOLDS):
-            found = fitted(shares, piece != fold)
-            if found is None:
-                return np.inf
-            error = (basis @ found - wanted)[piece == fold]
-            total += float(np.sum(weight[piece == fold] * error**2))
-        return total
-
-    chosen: list[float] = []
-    best = held_out(chosen)
-    while len(chosen) < MOST_PLAYS:
-        tried = [sorted([*chosen, share]) for share in RADII if share not in chosen]
-        scores = [held_out(shares) for shares in tried]
-        index = int(np.argmin(scores))
-        if scores[index] > (1.0 - WORTH_SHARE) * best:
-            break
-        best, chosen = scores[index], tried[index]
-    found = fitted(chosen, np.ones(len(units), np.bool_))
-    if found is None or not chosen:
-        return Memory()
-    return _inverse([share * highest_kpa for share in chosen], found[hinges.shape[1] :].tolist())
-
-
-def _play_lag(pressure: Floats, radius_kpa: float) -> Floats:
-    """Return how far a play of the pressure [t] lags behind its value while loading."""
-    play, result = 0.0, np.empty_like(pressure)
-    for row, kpa in enumerate(pressure.tolist()):
-        play = min(max(play, kpa - radius_kpa), kpa + radius_kpa)
-        result[row] = play - max(kpa - radius_kpa, 0.0)
-    return result
-
-
-def _inverse(radius_kpa: list[float], weight: list[float]) -> Memory:
-    """Plays of the reading that undo plays of the pressure.
-
-    After a turn the reading follows with the slope 1 - sum of the weights of the plays that
-    have not yet turned, until twice their radius; the inverse has the inverse slopes.
-    """
-    slope, rho, r = 1.0 - sum(weight), 0.0, 0.0
-    slopes, radii = [1.0 / slope], []
-    for next_rho, share in zip(radius_kpa, weight, strict=True):
-        r += slope * (next_rho - rho)
-        rho, slope = next_rho, slope + share
-        radii.append(r)
-        slopes.append(1.0 / slope)
-    weights = [before - after for before, after in pairwise(slopes)]
-    return Memory(tuple(round(r, 3) for r in radii), tuple(round(w, 4) for w in weights))
-
-
-def _loading_kpa(pressure: Floats, memory: Memory) -> Floats:
-    """Return what a pad of the foam reads [t] under pressures [t]: the inverse of C -
-    relaxation(C).
-
-    The solution is unique, because C - relaxation rises with C. For each sample the step of C is
-    found by trying each possible state of the plays.
-    """
-    if not memory.radius_kpa:
-        return pressure
-    radius, weight = np.array(memory.radius_kpa), np.array(memory.weight)
-    plays = np.zeros(len(radius))
-    result = np.empty_like(pressure)
-    reading = 0.0
-    for row, wanted in enumerate(np.maximum(pressure, 0.0)):
-        # Newton's method on a piecewise linear function ends after at most as many steps as it has
-        # pieces.
-        for _ in range(4 * len(radius) + 2):
-            moved = np.minimum(np.maximum(plays, reading - radius), reading + radius)
-            over = reading - radius
-            value = reading - float(weight @ (moved - np.maximum(over, 0.0)))
-            slope = 1.0 - float(weight @ ((moved != plays) * 1.0 - (over > 0.0)))
-            step = (wanted - value) / slope
-            reading = max(reading + step, 0.0)
-            if abs(step) < 1e-6:
-                break
-        plays = np.minimum(np.maximum(plays, reading - radius), reading + radius)
-        result[row] = reading
-    return result
 
 
 def _fit_curve(units: Floats, kpa: Floats, weight: Floats, top: float) -> Floats:

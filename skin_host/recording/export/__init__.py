@@ -27,6 +27,8 @@ from skin_host.recording.export.series import (
 
 __all__ = ["HealthLine", "PartSeries", "Series", "export", "read_frames", "read_messages"]
 
+#: With this a table of a part's frames begins.
+_HEAD = b"seq,t_ns,taxel_0_kpa"
 SUFFIXES = ("", ".npz", ".parquet", ".mcap", ".rrd")
 
 
@@ -49,8 +51,8 @@ def export(
     tables, `touches.csv`, `slips.csv`, ..., also without rows: one of an earlier export would stay.
 
     Raises:
-        RequestError: the suffix is another one, the format has no place for this recording, or a
-            file to write is `recording`.
+        RequestError: the suffix is another one, the format has no place for this recording, a file
+            to write is `recording`, or the folder has a part of another one.
         SkinError: it cannot be written, or the package for it is not installed.
     """
     if output.suffix not in SUFFIXES:
@@ -90,8 +92,34 @@ def export(
         return write_together([(output, buffer.getvalue())])
     tables = {name: _frame_table(part) for name, part in series.parts.items()}
     tables |= {table.name: _text_table(table, getattr(series, table.name)) for table in TABLES}
+    _refuse_other_parts(output, series)
     files = ((output / f"{name}.csv", text.encode()) for name, text in tables.items())
     return write_together(files, [] if recording is None else [recording])
+
+
+def _refuse_other_parts(output: Path, series: Series) -> None:
+    """Refuse a folder with the frames of a part that would be read as one of this recording.
+
+    Raises:
+        RequestError: there is one.
+    """
+    for path in sorted(output.glob("*.csv")):
+        if path.stem not in series.parts and _has_frames(path):
+            raise RequestError(
+                f"{output}: holds {path.name}, a part that this recording does not have; wanted "
+                "another folder, or remove it"
+            )
+
+
+def _has_frames(path: Path) -> bool:
+    """Whether a file is a table of a part's frames, as far as it can be read."""
+    if not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_HEAD)) == _HEAD
+    except OSError:
+        return False
 
 
 def _arrays(series: Series) -> Iterator[tuple[str, Any]]:

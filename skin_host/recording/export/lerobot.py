@@ -12,18 +12,21 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.errors import RequestError, required
-from skin_host.files import write_together
+from skin_host.files import read_whole, write_together
 from skin_host.recording import seconds
 from skin_host.recording.export.series import PartSeries, Series
+from skin_host.untrusted import from_json
 
 VERSION = "v2.1"
 #: Episodes in a folder.
 CHUNK = 1000
 TASK = "tactile recording"
+_INFO = "meta/info.json"
 #: LeRobot reads times as float32: from 1024 s on, two of them may differ by 0.1 ms too much.
 EPISODE_S = 1000
 #: Three days at 40 Hz; more are mostly a gap.
@@ -54,12 +57,18 @@ def write_lerobot(series: Series, output: Path, layout: dict[str, Any]) -> list[
     Raises:
         SkinError: pyarrow is not installed, or a file cannot be written.
         RequestError: there are no frames; the times of a part go back, or stand still; there are
-            more than `MOST_STEPS`; or the folder has episodes of another data set.
+            more than `MOST_STEPS`; or the folder has the data set of another recording.
     """
     required("pyarrow", "data sets of LeRobot", "parquet")
     grid = _Grid(series, output)
-    _refuse_others(output, {_episode_path(n) for n in range(grid.episodes)})
-    return write_together((output / path, data) for path, data in _files(series, grid, layout))
+    recording = {
+        "parts": sorted(series.parts),
+        "begin_ns": grid.start_ns,
+        "end_ns": max(int(part.t_ns[-1]) for part in series.parts.values()),
+    }
+    _refuse_others(output, {_episode_path(n) for n in range(grid.episodes)}, recording)
+    skin = {**layout, "recording": recording}
+    return write_together((output / path, data) for path, data in _files(series, grid, skin))
 
 
 class _Grid:
@@ -131,18 +140,34 @@ def _episode_path(episode: int) -> str:
     return f"data/chunk-{episode // CHUNK:03d}/episode_{episode:06d}.parquet"
 
 
-def _refuse_others(output: Path, mine: set[str]) -> None:
-    """Refuse a folder with episodes that would be read as some of this data set.
+def _refuse_others(output: Path, mine: set[str], recording: dict[str, Any]) -> None:
+    """Refuse a folder with the data set of another recording, or with episodes that would be read
+    as some of this one.
 
     Raises:
         RequestError: there are some.
     """
-    there = (path.relative_to(output).as_posix() for path in output.glob("data/*/*.parquet"))
-    if others := sorted(set(there) - mine):
+    there = {path.relative_to(output).as_posix() for path in output.glob("data/*/*.parquet")}
+    if others := sorted(there - mine):
         raise RequestError(
             f"{output}: holds {others[0]}, which is none of this data set's {len(mine)}; wanted "
             "another folder, or remove this one"
         )
+    if there and _recording_of(output) != recording:
+        raise RequestError(
+            f"{output}: holds a data set that is not known to be of this recording; wanted another "
+            "folder, or remove this one"
+        )
+
+
+def _recording_of(output: Path) -> Any:
+    """Return what the data set in a folder names as its recording; None where that is not known."""
+    try:
+        info = from_json(read_whole(output / _INFO), dict[str, Any])
+    except (OSError, msgspec.DecodeError):
+        return None
+    skin = info.get("skin")
+    return skin.get("recording") if isinstance(skin, dict) else None
 
 
 def _files(series: Series, grid: _Grid, layout: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
@@ -178,7 +203,7 @@ def _files(series: Series, grid: _Grid, layout: dict[str, Any]) -> Iterator[tupl
         "features": features,
         "skin": layout,
     }
-    yield "meta/info.json", json.dumps(info, indent=2).encode()
+    yield _INFO, json.dumps(info, indent=2).encode()
     for name, lines in (
         ("tasks", [{"task_index": 0, "task": TASK}]),
         ("episodes", episodes),

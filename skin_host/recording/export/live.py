@@ -9,18 +9,18 @@ import os
 import secrets
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from skin_host.client import SkinClient
+from skin_host.client import Described, Frame, SkinClient
 from skin_host.clock import SYSTEM, Clock
 from skin_host.errors import SkinError, required
 from skin_host.mqtt.broker import free_port
-from skin_host.mqtt.info import PartInfo
+from skin_host.mqtt.info import FingertipInfo, PartInfo
 from skin_host.processing.events import LATEST_NS, Touch
 from skin_host.recording.export.scene import (
     Item,
@@ -40,7 +40,7 @@ TRANSFORMS_S = 1.0
 #: Rerun's server answers within this time.
 STARTING_S = 30.0
 
-#: Takes the scene when it is known, and returns what shows an item.
+#: Takes the scene when it is known, and each that follows it; returns what shows its items.
 Show = Callable[[SkinScene], Callable[[Item], None]]
 #: A viewer's server while it runs: its URL, and how it shows.
 Serving = AbstractAsyncContextManager[tuple[str, Show]]
@@ -62,52 +62,97 @@ async def run(
         SkinError: no broker, no robot, a port that is taken, or a package that is not installed.
     """
     async with SkinClient(broker, robot=robot) as skin:
-        nodes = await skin.info()
-        shapes = {name: part for node in nodes.values() for name, part in node.parts.items()}
+        await skin.info()
         async with serving as (url, begin):
-            fingertips = {
-                name: tip for node in nodes.values() for name, tip in node.fingertips.items()
-            }
-            scene = SkinScene(shapes, fingertips=fingertips)
-            show = begin(scene)
+            view = _View(begin, clock)
+            view.lay_out(skin.parts(), [])
             show_url(url)
-            await until(stop, _follow(skin, shapes, scene, show, clock))
+            await until(stop, _follow(skin, view, clock))
 
 
-async def _follow(
-    skin: SkinClient,
-    shapes: dict[str, PartInfo],
-    scene: SkinScene,
-    show: Callable[[Item], None],
-    clock: Clock,
-) -> None:
+class _View:
+    """What is shown of a robot's parts, as they are described now.
+
+    Attributes:
+        shapes: where the taxels of each part of skin are.
+        scene: makes the items.
+        show: shows an item.
+    """
+
+    def __init__(self, begin: Show, clock: Clock) -> None:
+        self._begin = begin
+        self._clock = clock
+        self._infos: dict[str, PartInfo | FingertipInfo] | None = None
+        self._last_ns: dict[str, int] = {}
+        self.shapes: dict[str, PartInfo] = {}
+
+    def lay_out(self, parts: Mapping[str, Described], touches: Iterable[Touch]) -> None:
+        """Begin again with these parts, if they are others, and what touches them."""
+        infos = {name: one.info for name, one in parts.items() if one.info is not None}
+        if infos == self._infos:
+            return
+        for name in (self._infos or {}).keys() - infos.keys():
+            self.show_unknown(name)
+            self.show_untouched(name)
+        self._infos = infos
+        self.shapes = {name: one for name, one in infos.items() if isinstance(one, PartInfo)}
+        tips = {name: one for name, one in infos.items() if isinstance(one, FingertipInfo)}
+        self.scene = SkinScene(self.shapes, fingertips=tips)
+        self.show = self._begin(self.scene)
+        for touch in touches:
+            self.show_touch(touch)
+
+    def show_frame(self, frame: Frame) -> None:
+        """Show the pressures of a part that is described as the frame has it."""
+        shape = self.shapes.get(frame.part)
+        if shape is not None and len(frame.valid) == len(shape.pads):
+            self._last_ns[frame.part] = frame.t_ns
+            kpa = np.where(frame.valid, frame.pressure_kpa, np.nan)
+            self.show(self.scene.points(frame.part, frame.t_ns, kpa, frame.beyond_range))
+
+    def show_touch(self, touch: Touch) -> None:
+        if touch.part in self.scene.origins_m:
+            self.show(self.scene.arrows(touch.part, touch.t_ns, [touch]))
+
+    def show_untouched(self, part: str) -> None:
+        if part in self.scene.origins_m:
+            self.show(self.scene.untouched(part, self._now_ns(part)))
+
+    def show_unknown(self, part: str) -> None:
+        """Show that nothing is known of a part: it must not go on looking as it was last."""
+        if part in self.shapes:
+            self.show(self.scene.unknown(part, self._now_ns(part)))
+
+    def _now_ns(self, part: str) -> int:
+        """Return the time of what follows the last frame of a part."""
+        return max(self._clock.now_ns(), min(self._last_ns.get(part, 0) + 1, LATEST_NS))
+
+
+async def _follow(skin: SkinClient, view: _View, clock: Clock) -> None:
     """Show what comes, until cancelled."""
 
-    last_ns: dict[str, int] = {}
+    async def infos() -> None:
+        async for _ in skin.infos():
+            view.lay_out(skin.parts(), skin.present())
 
     async def frames() -> None:
         async for frame in skin.frames():
-            if frame.part in shapes and len(frame.valid) == len(shapes[frame.part].pads):
-                last_ns[frame.part] = frame.t_ns
-                kpa = np.where(frame.valid, frame.pressure_kpa, np.nan)
-                show(scene.points(frame.part, frame.t_ns, kpa, frame.beyond_range))
+            view.show_frame(frame)
 
     async def events() -> None:
         async for event in skin.events():
-            if isinstance(event, Touch) and event.part in scene.origins_m:
-                show(scene.arrows(event.part, event.t_ns, [event]))
+            if isinstance(event, Touch):
+                view.show_touch(event)
             line = event_line(event)
             if line is not None:
-                show(line)
+                view.show(line)
 
     async def contacts() -> None:
-        """What is not received any more must not go on looking as it was last."""
         async for contact in skin.contacts():
-            t_ns = max(clock.now_ns(), min(last_ns.get(contact.part, 0) + 1, LATEST_NS))
-            if contact.state == "OFF" and contact.part in scene.origins_m:
-                show(scene.untouched(contact.part, t_ns))
-            elif contact.why not in (None, "not_felt") and contact.part in shapes:
-                show(scene.unknown(contact.part, t_ns))
+            if contact.state == "OFF":
+                view.show_untouched(contact.part)
+            elif contact.why not in (None, "not_felt"):
+                view.show_unknown(contact.part)
 
     async def health() -> None:
         latest: dict[str, str] = {}
@@ -115,10 +160,10 @@ async def _follow(
             line = health_line(said.part, clock.now_ns(), said.record)
             if latest.get(said.part) != line.text:
                 latest[said.part] = line.text
-                show(line)
+                view.show(line)
 
     async with asyncio.TaskGroup() as group:
-        for follow in (frames, events, contacts, health):
+        for follow in (infos, frames, events, contacts, health):
             group.create_task(follow())
 
 
@@ -137,20 +182,26 @@ async def foxglove(host: str, port: int | None) -> AsyncIterator[tuple[str, Show
         server = sdk.start_server(name="skin-host", host=host, port=wanted, context=context)
     except (RuntimeError, OSError) as error:
         raise SkinError(f"{host}:{wanted}: {error}; choose another --host or --port") from None
+    channels: dict[str, Any] = {}
     try:
-        yield f"ws://{host}:{server.port} in Foxglove", lambda scene: _Foxglove(sdk, context, scene)
+        yield (
+            f"ws://{host}:{server.port} in Foxglove",
+            lambda scene: _Foxglove(sdk, context, channels, scene),
+        )
     finally:
         server.stop()
 
 
 class _Foxglove:
-    """Sends items on channels of a context; a channel is made when its first message comes."""
+    """Sends items of a scene on channels of a context; a channel is made when its first message
+    comes.
+    """
 
-    def __init__(self, sdk: Any, context: Any, scene: SkinScene) -> None:
+    def __init__(self, sdk: Any, context: Any, channels: dict[str, Any], scene: SkinScene) -> None:
         self._sdk = sdk
         self._context = context
         self._scene = scene
-        self._channels: dict[str, Any] = {}
+        self._channels = channels
         self._sent_ns = 0
 
     def __call__(self, item: Item) -> None:

@@ -92,19 +92,20 @@ export class History {
   }
 }
 
-/** One value over time, such as a force: what does not change takes two points. */
+/** One value over time, and whether it is a bound from below, such as a force: what does not change takes two points. */
 export class Course {
   constructor() { this.points = []; }
 
   get last() { return this.points.at(-1)?.[0] ?? -Infinity; }
 
-  add(nowMs, value) {
+  add(nowMs, value, isLeast) {
     const points = this.points;
+    const same = (point) => point[1] === value && point[2] === isLeast;
     // Two pictures of one moment are one.
     if (nowMs - this.last < 5) points.pop();
     const n = points.length;
-    if (n > 1 && points[n - 1][1] === value && points[n - 2][1] === value && nowMs - points[n - 1][0] < GAP_MS) points[n - 1][0] = nowMs;
-    else points.push([nowMs, value]);
+    if (n > 1 && same(points[n - 1]) && same(points[n - 2]) && nowMs - points[n - 1][0] < GAP_MS) points[n - 1][0] = nowMs;
+    else points.push([nowMs, value, isLeast]);
     if (n > 1000 && points[n >> 1][0] < nowMs - LONGEST_S * 1000) this.points = points.slice(n >> 1);
   }
 

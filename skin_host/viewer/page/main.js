@@ -2,7 +2,7 @@
 import { calibrated } from "./calibrated.js";
 import { DASHES, paper, ramp, shareOf, theme } from "./colours.js";
 import { SkinMap } from "./map.js";
-import { isLeast, put, showContacts, showHealth, showParts } from "./panels.js";
+import { isLeast, put, showContacts, showHealth, showParts, told } from "./panels.js";
 import { Store } from "./store.js";
 import { HAS_PLOTS, lineColour, nearest, Plot, roundTicks } from "./strip.js";
 
@@ -21,6 +21,8 @@ let link = "connecting";
 let dirty = true;
 /** The calibration that is going on: of which part (null: the whole skin), how many nodes were asked, and their answers. */
 let calibrating = null;
+/** Nodes that have refused raw values since they were asked last. */
+const refused = new Set();
 let endedSaid = "";
 let notice = null;
 let peaks = [];
@@ -83,13 +85,9 @@ function send(wish) {
 }
 
 function answered(message) {
-  if (message.do === "raw" && message.ok) return;
+  if (message.do === "raw") return message.ok || !map.raw || refuseRaw(message);
   if (message.do === "calibrate") return takeCalibration(message);
-  if (!message.ok) {
-    say(message.error, 8000);
-    if (map.raw && message.do === "raw") setRaw(false);
-    return;
-  }
+  if (!message.ok) return say(message.error, 8000);
   if (message.do === "record") return say(`Recording to ${message.result.file}`, 4000, "ok");
   if (message.do === "mark") return say(`Mark ${message.result.marks}`, 2000, "ok");
   if (message.do === "stop") {
@@ -127,9 +125,10 @@ function step(by) {
 
 function nodesShown() { return [...new Set(map.parts.map((part) => part.node))]; }
 
-function mayCommand() {
-  return store.status.commands && nodesShown().some((node) => store.nodes[node]?.commands && store.status.nodes[node] !== false);
-}
+/** Whether a node takes commands, as far as is known. */
+function takesCommands(node) { return Boolean(store.nodes[node]?.commands) && store.status.nodes[node] !== false; }
+
+function mayCommand() { return store.status.commands && nodesShown().some(takesCommands); }
 
 function setRaw(on) {
   if (on && !mayCommand()) return say("Raw values are sent on request, and commands are not allowed here.", 4000);
@@ -141,8 +140,20 @@ function setRaw(on) {
   dirty = true;
 }
 
+/** Nodes that send raw values, or have not refused to. */
+function rawNodes() { return [...new Set(store.parts.map((part) => part.node))].filter((node) => takesCommands(node) && !refused.has(node)); }
+
 function askRaw() {
-  for (const node of new Set(store.parts.map((part) => part.node))) send({ do: "raw", node });
+  refused.clear();
+  for (const node of rawNodes()) send({ do: "raw", node });
+}
+
+/** Raw values are left only when no node sends any. */
+function refuseRaw({ node, error }) {
+  refused.add(node);
+  if (rawNodes().length) return;
+  say(error, 8000);
+  setRaw(false);
 }
 
 setInterval(() => { if (map.raw) askRaw(); }, RAW_AGAIN_MS);
@@ -279,7 +290,8 @@ function staleText(stale) {
 
 function showStatus(nowMs) {
   const status = $("status");
-  const nodes = Object.entries(store.status.nodes ?? {});
+  // A node whose parts others have now may be offline for ever.
+  const nodes = Object.entries(store.status.nodes ?? {}).filter(([node]) => store.parts.some((part) => part.node === node));
   const [offline, unknown] = [false, null].map((state) => nodes.filter(([, online]) => online === state).map(([node]) => node).join(", "));
   const stale = store.parts.filter((part) => part.stale(nowMs));
   let [text, level] = ["", "ok"];
@@ -297,11 +309,19 @@ function showStatus(nowMs) {
   const uncalibrated = stale.length > 0 && stale.every(isUncalibrated) && store.status.connected && link !== "lost";
   const allStale = shown.length > 0 && shown.every((part) => part.stale(nowMs));
   if (notice && nowMs > notice.until) notice = null;
-  const words = notice?.text ?? (link === "lost" || (store.parts.length && (!store.status.connected || allStale)) ? (uncalibrated ? text : `Stale: ${text}`) : map.raw && shown.some((part) => !part.raw && !part.stale(nowMs)) ? "Waiting for raw values" : "");
+  const words = notice?.text ?? (link === "lost" || (store.parts.length && (!store.status.connected || allStale)) ? (uncalibrated ? text : `Stale: ${text}`) : rawWords(nowMs));
   banner.hidden = !words;
   banner.style.background = notice ? `var(--${notice.level})` : "";
   if (banner.textContent !== words) banner.textContent = words;
   document.body.dataset.stale = String(allStale || link !== "open" || !store.status.connected);
+}
+
+/** What is missing while raw values are shown. */
+function rawWords(nowMs) {
+  const without = map.raw ? map.parts.filter((part) => !part.raw && !part.stale(nowMs)) : [];
+  const nodes = rawNodes();
+  if (without.some((part) => nodes.includes(part.node))) return "Waiting for raw values";
+  return without.length ? `No raw values are sent of ${named(without)}` : "";
 }
 
 /** The next number of 1, 2, 5, 10, 20, ... */
@@ -407,9 +427,8 @@ function showPlots(nowMs) {
   forces.forEach(({ name, course }, i) => {
     const [, seen, isLeastThen] = (atMs === null ? course.at(-1) : at(course)) ?? [];
     const isTotal = name === "total";
-    const least = isTotal && (atMs === null && heldMs === null ? isLeast(shownParts(), nowMs) : isLeastThen);
-    const none = isTotal ? "not known" : "–";
-    put(list.children[i].lastChild, `${name}: ${Number.isFinite(seen) ? `${least ? "≥ " : ""}${seen.toFixed(2)} N` : none}`);
+    const least = isTotal && atMs === null && heldMs === null ? isLeast(shownParts(), nowMs) : isLeastThen;
+    put(list.children[i].lastChild, `${name}: ${isTotal && !Number.isFinite(seen) ? "not known" : told(seen, 2, "N", least)}`);
   });
 }
 
@@ -420,15 +439,16 @@ function forceLines(seconds, fromMs, endMs) {
     const courses = shownParts().map((part) => part.forces.between(fromMs, endMs));
     if (courses.length === 1) return courses[0];
     // One course for all parts: each part's force counts until it says another.
-    const events = courses.flatMap((course, k) => course.map(([t, value]) => [t, k, value])).sort((a, b) => a[0] - b[0]);
+    const events = courses.flatMap((course, k) => course.map(([t, value, least]) => [t, k, value, least])).sort((a, b) => a[0] - b[0]);
     // Nothing is known of a part before it says so; with others, a sum is the least that there is.
-    const now = new Array(courses.length).fill(null);
-    let [sum, unknown] = [0, courses.length];
-    return events.map(([t, k, value]) => {
-      sum = Math.max(0, sum + (value ?? 0) - (now[k] ?? 0));
-      unknown += (value === null) - (now[k] === null);
-      now[k] = value;
-      return [t, unknown && sum < 1e-9 ? null : sum, unknown > 0];
+    const now = courses.map(() => ({ value: null, least: true }));
+    let [sum, unknown, bounds] = [0, courses.length, courses.length];
+    return events.map(([t, k, value, least]) => {
+      sum = Math.max(0, sum + (value ?? 0) - (now[k].value ?? 0));
+      unknown += (value === null) - (now[k].value === null);
+      bounds += least - now[k].least;
+      now[k] = { value, least };
+      return [t, unknown && sum < 1e-9 ? null : sum, bounds > 0];
     });
   });
   const lines = [{ name: "total", course: total, colour: look.text, dash: [] }];

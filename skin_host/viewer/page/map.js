@@ -1,6 +1,8 @@
 // The drawing of the skin: parts side by side, or one of them large.
 import { drawer } from "./body.js";
 import { paper, ramp, shareOf } from "./colours.js";
+import { told } from "./panels.js";
+import { isBound } from "./store.js";
 
 const GAP_MM = 14;
 const LABEL_PX = 20;
@@ -460,7 +462,7 @@ export class SkinMap {
         ctx.moveTo(cx, cy - 6); ctx.lineTo(cx, cy + 6);
         halo(ctx, look, 2);
       }
-      this.drawLabel(ctx, look, hull, [cx, cy], `#${contact.id}  ${contact.force_n.toFixed(contact.force_n < 10 ? 2 : 1)} N`);
+      this.drawLabel(ctx, look, hull, [cx, cy], `#${contact.id}  ${told(contact.force_n, contact.force_n < 10 ? 2 : 1, "N", isBound(contact))}`);
       ctx.globalAlpha = 1;
     }
   }

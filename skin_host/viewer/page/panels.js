@@ -1,4 +1,6 @@
 // Contacts, health, parts: what stands in words beside the map.
+import { isBound } from "./store.js";
+
 const LEVELS = { ok: "ok", warning: "warn", degraded: "warn", disabled: "warn" };
 
 export function level(part, nowMs) {
@@ -56,8 +58,20 @@ function untouched(parts, touched, nowMs) {
   return said.join(" ");
 }
 
-/** Whether there may be more contacts of these parts than are known. */
-export function isLeast(parts, nowMs) { return parts.some((part) => part.force(nowMs) === null || part.unknown(nowMs) !== null); }
+/** Whether more may press on these parts than is known. */
+export function isLeast(parts, nowMs) { return parts.some((part) => part.isLeast(nowMs)); }
+
+const VERDICTS = {
+  no_single_contact: "no one push gives this force and torque",
+  several_contacts: "several things touch it",
+  saturated: "its board is at the end of its range",
+};
+
+/** What there is to know of the numbers of a contact. */
+function remarks({ verdict, partial, beyond }) {
+  const said = [VERDICTS[verdict], beyond && verdict !== "saturated" && "a pad is pressed beyond its calibrated range", partial && "pads beside it are not valid"];
+  return said.filter(Boolean).join("; ");
+}
 
 /** Contacts of the parts that are shown, with their sum; the pointer and a click mark one. */
 export function showContacts(table, hint, parts, map, nowMs, point, select) {
@@ -89,11 +103,13 @@ export function showContacts(table, hint, parts, map, nowMs, point, select) {
     row.dataset.part = name;
     row.dataset.id = contact.id;
     row.setAttribute("aria-selected", String(map.selected?.part === name && map.selected.id === contact.id));
-    const cells = [name, `#${contact.id}`, told(contact.force_n, 2, "N"), told(contact.peak_kpa, 1, "kPa"), told(contact.area_mm2, 0, "mm²")];
+    row.title = remarks(contact);
+    const { partial, beyond } = contact;
+    const cells = [name, `#${contact.id}`, told(contact.force_n, 2, "N", isBound(contact)), told(contact.peak_kpa, 1, "kPa", partial || beyond), told(contact.area_mm2, 0, "mm²", partial)];
     cells.forEach((text, k) => put(row.children[k], text));
   });
   const total = rows.reduce((sum, [, contact]) => sum + contact.force_n, 0);
-  put(table.tFoot.rows[0].cells[2], `${isLeast(parts, nowMs) ? "≥ " : ""}${told(total, 2, "N")}`);
+  put(table.tFoot.rows[0].cells[2], told(total, 2, "N", isLeast(parts, nowMs)));
   table.tFoot.hidden = rows.length < 2;
 }
 
@@ -212,9 +228,9 @@ function ages(part, nowMs, end) {
   return part.heardMs !== null && part.isHealthOld(nowMs) ? [`No health ${since(part.healthMs)}`] : [];
 }
 
-/** A number with its unit; where there is no skin there is no pressure and no area. */
-function told(value, decimals, unit) {
-  return Number.isFinite(value) ? `${value.toFixed(decimals)} ${unit}` : "–";
+/** A number with its unit, and whether it is a bound from below; where there is no skin there is no pressure and no area. */
+export function told(value, decimals, unit, isLeast = false) {
+  return Number.isFinite(value) ? `${isLeast ? "≥ " : ""}${value.toFixed(decimals)} ${unit}` : "–";
 }
 
 function put2(node, text) {

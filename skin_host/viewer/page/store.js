@@ -16,6 +16,9 @@ const WHY = {
 /** States of health in which a part feels nothing; they are the reason, too. */
 const NOT_IN_USE = ["not calibrated", "disabled"];
 
+/** Whether a contact presses at least as hard as its force: a board at the end of its range, pads beyond theirs, or not valid. */
+export function isBound({ verdict, partial, beyond }) { return verdict === null ? partial || beyond : verdict === "saturated"; }
+
 export class Part {
   constructor(info) {
     this.name = info.name;
@@ -68,11 +71,14 @@ export class Part {
     return this.contacts.reduce((sum, contact) => sum + contact.force_n, 0);
   }
 
+  /** Whether more may press on it than its force: not all is felt, or not to its end. */
+  isLeast(nowMs) { return this.force(nowMs) === null || this.unknown(nowMs) !== null || this.contacts.some(isBound); }
+
   rememberForces(nowMs) {
-    this.forces.add(nowMs, this.force(nowMs));
+    this.forces.add(nowMs, this.force(nowMs), this.isLeast(nowMs));
     for (const contact of this.contacts) {
       if (!this.forceOf.has(contact.id)) this.forceOf.set(contact.id, new Course());
-      this.forceOf.get(contact.id).add(nowMs, contact.force_n);
+      this.forceOf.get(contact.id).add(nowMs, contact.force_n, isBound(contact));
     }
     for (const [id, course] of this.forceOf) if (course.last < nowMs - LONGEST_S * 1000) this.forceOf.delete(id);
   }

@@ -231,8 +231,8 @@ MUTANTS = [
     Mutant(
         "all pressures are a fifth",
         "processing/pipeline.py",
-        "return self._frame(t_ns, raw, valid, pressure, touched, beyond, True)",
-        "return self._frame(t_ns, raw, valid, 0.2 * pressure, touched, beyond, True)",
+        "frame = self._frame(t_ns, raw, valid, pressure, touched, beyond, True)",
+        "frame = self._frame(t_ns, raw, valid, 0.2 * pressure, touched, beyond, True)",
     ),
     Mutant(
         "touches need ten units more",

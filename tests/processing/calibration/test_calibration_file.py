@@ -9,7 +9,11 @@ import pytest
 from skin_host.errors import CalibrationError
 from skin_host.processing import calibration
 from skin_host.processing.calibration import Verdict
-from skin_host.processing.calibration.file import load_calibration, save_calibration, with_gains_of
+from skin_host.processing.calibration.file import (
+    find_calibration,
+    load_calibration,
+    save_calibration,
+)
 from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory, rising
 from tests.support.calibrated import LAYOUT, TIME, N, calibrated, noisy
 
@@ -77,11 +81,11 @@ def test_pads_that_are_not_used_may_have_any_noise(untouched, tmp_path):
 
 def test_gains_outlive_a_new_zero(untouched, tmp_path):
     path = tmp_path / "calibration.json"
-    assert with_gains_of(untouched, path, LAYOUT) is untouched
+    assert find_calibration(path, LAYOUT, "abc") is None
     fitted = calibration.with_gains(untouched, np.full(N, 1.2), np.full(N, 0.9))
     save_calibration(path, fitted, LAYOUT)
     renewed = calibrated(noisy(np.random.default_rng(77)))
-    kept = with_gains_of(renewed, path, LAYOUT)
+    kept = calibration.with_pressures_of(renewed, load_calibration(path, LAYOUT, "abc"))
     assert kept.gain == pytest.approx(np.full(N, 1.2))
     assert kept.bend == pytest.approx(np.full(N, 0.9))
     assert kept.baseline == pytest.approx(renewed.baseline)
@@ -185,9 +189,10 @@ def test_curves_are_kept_with_it_and_outlive_new_zeros(untouched, tmp_path):
     assert np.array_equal(np.flatnonzero(fitted.usable), range(7))
     path = tmp_path / "calibration.json"
     save_calibration(path, fitted, LAYOUT)
-    renewed = with_gains_of(calibrated(noisy(np.random.default_rng(77))), path, LAYOUT)
+    kept = load_calibration(path, LAYOUT, "abc")
+    renewed = calibrated(noisy(np.random.default_rng(77)))
     every = np.ones(N, bool)
-    for found in (load_calibration(path, LAYOUT, "abc"), renewed):
+    for found in (kept, calibration.with_pressures_of(renewed, kept)):
         assert found.curves.kpa[:7] == pytest.approx(fitted.curves.kpa[:7], abs=1e-5)
         assert np.array_equal(found.curves.verdict, fitted.curves.verdict)
         assert found.curves.memory == fitted.curves.memory

@@ -9,11 +9,13 @@ from skin_host.layout import PadKind
 from skin_host.processing import calibration
 from skin_host.processing.calibration import Verdict
 from skin_host.processing.calibration.calibrator import (
+    FEWEST_SAMPLES,
     KNOWN_SAMPLES,
     NOISE_SAMPLES,
     PRESSED_UNITS,
     Calibrator,
     Known,
+    going_on,
 )
 from skin_host.processing.pipeline import Pipeline
 from tests.support.calibrated import LAYOUT, PRESENT, TIME, N, calibrated, noisy
@@ -380,6 +382,23 @@ def test_a_pad_of_unknown_noise_is_not_judged_by_what_shows_little_of_it(sd):
     assert (found.verdict == Verdict.TOO_FEW).all()
 
 
+@pytest.mark.parametrize("samples", [FEWEST_SAMPLES, NOISE_SAMPLES - 1, NOISE_SAMPLES])
+def test_a_few_bytes_at_an_end_of_the_scale_do_not_take_a_pad_out_of_use(samples):
+    before = calibrated(noisy(np.random.default_rng(8)))
+    sweeps = noisy(np.random.default_rng(9), sweeps=samples)
+    sweeps[:3, 5] = 255
+    found = calibrated(sweeps)
+    few = samples < NOISE_SAMPLES
+    assert found.verdict[5] == (Verdict.TOO_FEW if few else Verdict.OUT_OF_RANGE)
+    kept = going_on(found, Known(before, before.baseline, PRESENT))
+    assert kept.usable[5] == few
+    assert kept.baseline[5] == (before if few else found).baseline[5]
+    assert kept.unchanged[5] == few
+    doubted = going_on(found, Known(before, before.baseline, ~PRESENT))
+    assert not doubted.usable[5]
+    assert not doubted.unchanged.any()
+
+
 @pytest.mark.parametrize(("sd", "used"), [(0.3, True), (3.0, False)])
 def test_a_pad_of_known_noise_is_used_if_its_zero_is_known_well_enough_for_its_threshold(sd, used):
     rng = np.random.default_rng(8)
@@ -538,3 +557,33 @@ def test_lost_sweeps_do_not_shift_the_baseline():
     raw = np.where(present, sweeps, 0)
     expected = np.array([240.0 - sweeps[present[:, i], i].mean() for i in range(N)])
     assert calibrated(raw, present).baseline == pytest.approx(expected)
+
+
+def slowly_pressed(rise, sd, sweeps=125, seed=12):
+    """Sweeps in which all pads but the first 20 rise slowly together."""
+    raw = noisy(np.random.default_rng(seed), sweeps, sd)
+    raw[:, 20:] -= np.rint(np.linspace(0.0, rise, sweeps)[:, np.newaxis])
+    return raw
+
+
+@pytest.mark.parametrize("sweeps", [80, 125, 250])
+def test_a_slow_press_of_a_whole_part_is_a_touch_though_noise_hides_it_on_each_pad(sweeps):
+    found = calibrated(slowly_pressed(2.0, 1.2, sweeps))
+    pressure = LAYOUT.pad_kind == PadKind.PRESSURE
+    touched = found.verdict == Verdict.TOUCHED
+    assert touched[20:][pressure[20:]].mean() > 0.9
+    assert touched[:20].mean() < 0.2
+
+
+@pytest.mark.parametrize("sd", [0.4, 1.2, 3.0])
+def test_what_drifts_less_than_a_touch_while_it_is_calibrated_is_no_touch(sd):
+    for seed in range(5):
+        found = calibrated(slowly_pressed(0.5, sd, seed=seed))
+        assert not (found.verdict == Verdict.TOUCHED).any()
+
+
+def test_a_drift_that_is_followed_is_no_touch_in_a_long_calibration():
+    calibrator = Calibrator(LAYOUT)
+    for number, raw in enumerate(slowly_pressed(1.8, 1.2, 600)):
+        calibrator.add(0, np.asarray(raw, np.uint8), PRESENT, number * 50_000_000)
+    assert not (calibrator.finish("abc", TIME).verdict == Verdict.TOUCHED).any()

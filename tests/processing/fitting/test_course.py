@@ -25,6 +25,7 @@ from skin_host.processing.fitting.course import (
     fit_course,
     median_of_moving,
     read_course,
+    shown,
 )
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import PlayRelaxation
@@ -131,6 +132,30 @@ def test_each_pad_gets_its_verdict(pressed):
     verdict = fit_course(as_course(units, pressure), 0.5).verdict
     expected = ("GOOD", "DEAD", "JUMPS", "NOISY", "SATURATES", "GOOD")
     assert [CurveVerdict(number).name for number in verdict] == list(expected)
+
+
+@pytest.mark.parametrize("top_kpa", [60.0, 120.0, 300.0])
+def test_a_verdict_does_not_depend_on_how_high_the_course_goes(top_kpa):
+    pressure, units = under(staircase(top_kpa), noise=1.5)
+    rng = np.random.default_rng(2)
+    units[:, 3] += 15.0 * rng.choice([-1.0, 1.0], len(units))
+    verdict = fit_course(as_course(units, pressure), 0.5).verdict
+    expected = [CurveVerdict.GOOD] * 6
+    expected[3] = CurveVerdict.NOISY
+    assert verdict.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("top_kpa", "verdict"), [(50.0, CurveVerdict.UNKNOWN), (300.0, CurveVerdict.DEAD)]
+)
+def test_a_pad_is_dead_only_where_the_weakest_would_have_moved(top_kpa, verdict):
+    pressure, units = under(staircase(top_kpa))
+    units[:, 1] = 0.0
+    course = as_course(units, pressure)
+    curves = fit_course(course, 0.5)
+    good = CurveVerdict.GOOD
+    assert curves.verdict.tolist() == [good, verdict, good, good, good, good]
+    assert shown(course).tolist() == [True, verdict == CurveVerdict.DEAD, *[True] * 4]
 
 
 def test_taxels_that_were_not_received_keep_the_common_curve(pressed):

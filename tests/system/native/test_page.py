@@ -5,6 +5,7 @@ import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -339,6 +340,97 @@ async def test_nothing_touches_only_what_is_known_to_be_untouched(
         )
         await shows("Not known of palm, wrist, tip: the node is offline.", "not known")
         assert await seen.run(CONTACTS) == []
+
+
+async def test_a_force_that_is_only_a_bound_is_shown_as_one(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """Of skin beside dead pads, or pressed beyond its range; of a fingertip whose board is."""
+    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        await seen.run(SERVER)
+        await seen.run("setInterval(() => { pressed(0, 0); pressed(1, 0); health('tip', 0); }, 50)")
+        await seen.run("contacts('palm', 'OFF'); contacts('wrist', 'OFF'); contacts('tip', 'OFF')")
+
+        async def shows(part: str, cells: list[str], why: str, **changes: Any) -> None:
+            contact = {
+                "id": 4,
+                "taxels": [0] if part == "palm" else [],
+                "centroid_m": None,
+                "force_n": 1.5,
+                "peak_kpa": 9,
+                "area_mm2": 20,
+                "partial": False,
+                "beyond": False,
+                "verdict": None,
+            } | changes
+            await seen.run(f"contacts('{part}', 'ON', null, [{json.dumps(contact)}])")
+            row = [part, "#4", *cells]
+            await seen.until(f"JSON.stringify({CONTACTS}) === JSON.stringify({json.dumps([row])})")
+            total = f"total: {'≥ ' if '≥' in cells[0] else ''}1.50 N"
+            await seen.until(f"{TOTAL} === {json.dumps(total)}")
+            assert await seen.run('document.querySelector("#contacts tbody tr").title') == why
+            if part == "palm":
+                label = json.dumps(f"#4  {cells[0]}")
+                await seen.until(f"window.labels.some(([text]) => text === {label})")
+
+        await shows("palm", ["1.50 N", "9.0 kPa", "20 mm²"], "")
+        bounds = ["≥ 1.50 N", "≥ 9.0 kPa", "20 mm²"]
+        await shows("palm", bounds, "a pad is pressed beyond its calibrated range", beyond=True)
+        bounds = ["≥ 1.50 N", "≥ 9.0 kPa", "≥ 20 mm²"]
+        await shows("palm", bounds, "pads beside it are not valid", partial=True)
+        await seen.run("contacts('palm', 'OFF')")
+        bare = {"peak_kpa": None, "area_mm2": None}
+        bounds = ["≥ 1.50 N", "–", "–"]
+        end = "its board is at the end of its range"
+        await shows("tip", bounds, end, beyond=True, verdict="saturated", **bare)
+        # The board measures the force, whatever the pads on it do.
+        bounds = ["1.50 N", "≥ 9.0 kPa", "20 mm²"]
+        why = "a pad is pressed beyond its calibrated range"
+        await shows("tip", bounds, why, beyond=True, verdict="contact")
+
+
+RAW = 'document.getElementById("show-raw").ariaPressed === "true"'
+
+
+async def test_raw_values_stay_while_any_node_sends_them(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """One that is offline, or takes no commands, is not asked; one may refuse."""
+    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        await seen.run(SERVER)
+        await seen.run("""(() => {
+            window.asked = [];
+            const socket = window.sockets.at(-1);
+            socket.send = text => asked.push(JSON.parse(text));
+            const take = socket.onmessage;
+            // Of the server itself nothing comes any more.
+            socket.onmessage = () => {};
+            window.say = message => take.call(socket, { data: JSON.stringify(message) });
+            window.answer = (node, ok) => say({ type: "answer", do: "raw", node, ok, error: "no" });
+            const part = (name, node) => ({
+                name, node, period_ms: 50, pads: ["pressure"], position_m: [[0, 0, 0]],
+                normal: [[0, 0, 1]], radius_mm: [2], area_mm2: [20], triangles: [],
+            });
+            say({ type: "layout", version: 10, robot: "r", parts: [..."abcd"].map(n => part(n, n)),
+                  nodes: Object.fromEntries([..."abcd"].map(n => [n, { commands: n !== "d" }])) });
+            say({ type: "status", connected: true, commands: true, error: "",
+                  nodes: { a: true, b: false, c: null, d: true } });
+        })()""")
+        await seen.until('!document.getElementById("show-raw").disabled')
+        await seen.run('answer("b", false)')  # to what was asked before: nobody waits for it
+        await seen.run('document.getElementById("show-raw").click()')
+        await seen.until('document.getElementById("banner").textContent !== "no"')
+        wanted = [{"do": "raw", "node": "a"}, {"do": "raw", "node": "c"}]
+        assert await seen.run("asked") == wanted
+        await seen.run('answer("c", false)')
+        assert await seen.run(RAW)
+        await seen.run('answer("a", true)')
+        assert await seen.run(RAW)
+        await seen.run('answer("a", false)')
+        assert not await seen.run(RAW)
+        await seen.until('document.getElementById("banner").textContent === "no"')
 
 
 async def test_what_is_old_when_the_page_opens_is_not_shown_as_present(

@@ -1,0 +1,226 @@
+"""Pads that scatter beyond their range are found; those that measure what presses them are not."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skin_host.evaluation.rig import Rig
+from skin_host.processing.conversions import CONVERSION_S
+from skin_host.processing.scatter import LONGEST_S, MEMORY_CONVERSIONS, Scatter
+from tests.processing.fitting.test_course import use_own_curves
+
+#: A pad of the usual units: one is 8 kPa, and a step of 8 units is six deviations of its noise.
+UNIT_KPA = 8.0
+STEP_KPA = 64.0
+NOISE_KPA = STEP_KPA / 6.0
+RANGE_KPA = 300.0
+PADS = 12
+PERIODS_S = (0.01, 0.02, 0.05, 0.1)
+
+
+def look(scatter: Scatter, rows: np.ndarray, period_s: float = 0.05) -> list[int]:
+    return scatter.look(rows, [period_s] * len(rows), rows.max(axis=0)).tolist()
+
+
+def found(kpa: np.ndarray, period_s: float, range_kpa: float = RANGE_KPA) -> set[int]:
+    """Which of the pads [t, m] are found at any time, looked at as the pipeline does."""
+    m = kpa.shape[1]
+    scatter = Scatter(np.full(m, STEP_KPA, np.float32), np.full(m, range_kpa, np.float32))
+    rows = kpa.astype(np.float32)
+    pads: set[int] = set()
+    for begin in range(0, len(rows) - 7, 8):
+        pads.update(look(scatter, rows[begin : begin + 8], period_s))
+    return pads
+
+
+def read(kpa: np.ndarray, t_s: np.ndarray) -> np.ndarray:
+    """What boards send of pads [c, m] that are converted every `CONVERSION_S`, in whole units."""
+    at = np.minimum((t_s / CONVERSION_S).astype(np.intp), len(kpa) - 1)
+    sent: np.ndarray = np.rint(kpa[at] / UNIT_KPA) * UNIT_KPA
+    return sent
+
+
+def times(seconds: float, period_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """When pads are converted, and when they are sent: a slow board converts when it is asked."""
+    sent_s = np.arange(round(seconds / period_s)) * period_s
+    if period_s >= CONVERSION_S:
+        return sent_s, sent_s
+    return np.arange(round(seconds / CONVERSION_S) + 1) * CONVERSION_S, sent_s
+
+
+def noise(kind: str, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    if kind == "white":
+        return rng.normal(size=shape)
+    if kind == "heavy":
+        return rng.standard_t(3, size=shape) / np.sqrt(3.0)
+    slow = rng.normal(size=shape)
+    for row in range(1, len(slow)):
+        slow[row] = 0.9 * slow[row - 1] + np.sqrt(1.0 - 0.9**2) * slow[row]
+    return slow
+
+
+def pressed(kind: str, t_s: np.ndarray, hz: float, rng: np.random.Generator) -> np.ndarray:
+    """Pressures [t, PADS] of up to 700 kPa, far beyond the range."""
+    kpa = np.zeros((len(t_s), PADS))
+    for pad in range(PADS):
+        lasts_s = np.maximum(rng.normal(1.0, 0.08, int(2.0 * hz * t_s[-1]) + 2), 0.5) / hz
+        begins_s = np.cumsum(lasts_s) - lasts_s[0]
+        number = np.searchsorted(begins_s, t_s, side="right") - 1
+        phase = (t_s - begins_s[number]) / lasts_s[number]
+        peak = rng.uniform(300.0, 700.0, len(lasts_s))[number]
+        if kind == "taps":
+            kpa[:, pad] = np.where(phase < 0.6, peak * np.sin(np.pi * phase / 0.6), 0.0)
+        elif kind == "short taps on a load":
+            kpa[:, pad] = 150.0 + np.where(phase < 0.3, peak * np.sin(np.pi * phase / 0.3), 0.0)
+        elif kind == "steps":
+            kpa[:, pad] = peak
+        elif kind == "sliding":
+            kpa[:, pad] = peak * np.exp(-0.5 * ((phase - 0.5) / 0.1) ** 2)
+        else:
+            kpa[:, pad] = 400.0 + 200.0 * np.sin(2.0 * np.pi * phase)
+    return kpa
+
+
+def measured(
+    kind: str, hz: float, period_s: float, noisy: str = "white", seconds: float = 30.0
+) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    converted_s, sent_s = times(seconds, period_s)
+    kpa = pressed(kind, converted_s, hz, rng)
+    kpa += NOISE_KPA * noise(noisy, kpa.shape, rng)
+    return kpa if period_s >= CONVERSION_S else read(kpa, sent_s)
+
+
+@pytest.mark.parametrize("period_s", PERIODS_S)
+@pytest.mark.parametrize("levels", [2, 3, 0])
+def test_a_pad_that_reads_another_value_with_each_conversion_is_found_at_any_rate(
+    period_s: float, levels: int
+):
+    rng = np.random.default_rng(3)
+    converted_s, sent_s = times(30.0, period_s)
+    shape = (len(converted_s), PADS)
+    at = rng.integers(levels, size=shape) - 0.5 * (levels - 1) if levels else rng.normal(size=shape)
+    kpa = 450.0 + 12.0 * UNIT_KPA * at / np.std(at)
+    sent = read(kpa, sent_s) if period_s < CONVERSION_S else kpa
+    assert found(sent, period_s) == set(range(PADS))
+
+
+@pytest.mark.parametrize("period_s", PERIODS_S)
+@pytest.mark.parametrize("hz", [1.0, 3.0, 5.0, 6.5, 8.0])
+def test_taps_beyond_the_range_are_no_scatter_at_any_rate(period_s: float, hz: float):
+    assert not found(measured("taps", hz, period_s), period_s)
+
+
+@pytest.mark.parametrize("period_s", PERIODS_S)
+@pytest.mark.parametrize(
+    ("kind", "hz"),
+    [
+        ("short taps on a load", 1.0),
+        ("short taps on a load", 3.0),
+        ("steps", 0.3),
+        ("steps", 1.0),
+        ("sliding", 1.0),
+        ("sliding", 3.0),
+        ("pumped without a release", 0.5),
+        ("pumped without a release", 2.0),
+    ],
+)
+def test_no_press_that_goes_beyond_the_range_is_scatter(kind: str, hz: float, period_s: float):
+    assert not found(measured(kind, hz, period_s), period_s)
+
+
+@pytest.mark.parametrize("period_s", [*PERIODS_S, 0.2])
+@pytest.mark.parametrize("kind", ["white", "slow", "heavy"])
+def test_noise_beyond_the_range_is_no_scatter(kind: str, period_s: float):
+    rng = np.random.default_rng(2)
+    converted_s, sent_s = times(100.0, period_s)
+    kpa = 400.0 + NOISE_KPA * noise(kind, (len(converted_s), 50), rng)
+    assert not found(read(kpa, sent_s) if period_s < CONVERSION_S else kpa, period_s)
+
+
+@given(
+    seed=st.integers(0, 1000),
+    share=st.floats(0.1, 1.5),
+    level_kpa=st.floats(310.0, 2000.0),
+    period_s=st.sampled_from(PERIODS_S),
+)
+@settings(max_examples=20, deadline=None)
+def test_noise_up_to_one_and_a_half_times_what_was_measured_is_no_scatter(
+    seed: int, share: float, level_kpa: float, period_s: float
+):
+    rng = np.random.default_rng(seed)
+    kpa = level_kpa + share * NOISE_KPA * rng.normal(size=(600, PADS))
+    assert not found(kpa, period_s)
+
+
+def test_what_scatters_within_its_range_is_not_found():
+    rng = np.random.default_rng(3)
+    kpa = 450.0 + 12.0 * UNIT_KPA * rng.normal(size=(600, PADS))
+    assert found(kpa, 0.05) == set(range(PADS))
+    assert not found(kpa, 0.05, range_kpa=float(kpa.max()))
+    assert not found(kpa, 0.05, range_kpa=np.inf)
+
+
+def test_readings_too_far_apart_for_one_move_of_a_hand_are_not_compared():
+    rng = np.random.default_rng(3)
+    kpa = 450.0 + 12.0 * UNIT_KPA * rng.normal(size=(600, PADS))
+    assert found(kpa, LONGEST_S) == set(range(PADS))
+    assert not found(kpa, LONGEST_S + 0.001)
+
+
+def scattering(rng: np.random.Generator, samples: int) -> np.ndarray:
+    kpa: np.ndarray = 450.0 + 12.0 * UNIT_KPA * rng.normal(size=(samples, 2))
+    return kpa.astype(np.float32)
+
+
+def looked_at() -> Scatter:
+    """Two pads that scatter and are nearly found."""
+    scatter = Scatter(np.full(2, STEP_KPA, np.float32), np.full(2, RANGE_KPA, np.float32))
+    rng = np.random.default_rng(1)
+    rows = scattering(rng, 400)
+    for begin in range(0, 400, 4):
+        if len(look(scatter, rows[begin : begin + 4])) == 2:
+            return scatter
+    raise AssertionError
+
+
+def test_a_new_zero_and_a_pause_forget_what_was_read():
+    rows = scattering(np.random.default_rng(2), 4)
+    for taxels, left in (([True, False], [1]), ([False, False], [0, 1]), ([True, True], [])):
+        scatter = looked_at()
+        scatter.reset(np.array(taxels))
+        assert look(scatter, rows) == left
+    scatter = looked_at()
+    scatter.wait()
+    assert not look(scatter, rows)
+
+
+def test_a_pad_that_reads_steadily_again_is_not_found_any_more():
+    scatter = looked_at()
+    steady = np.full((8, 2), 400.0, np.float32)
+    for _ in range(3 * MEMORY_CONVERSIONS // 8):
+        look(scatter, steady)
+    assert not look(scatter, steady)
+
+
+def test_samples_that_come_one_by_one_are_judged_like_those_that_come_together():
+    rows = scattering(np.random.default_rng(4), 640)
+    each = [Scatter(np.full(2, STEP_KPA, np.float32), np.zeros(2, np.float32)) for _ in range(2)]
+    many = [look(each[0], rows[k : k + 8]) for k in range(0, 640, 8)]
+    few = [look(each[1], rows[k : k + 1]) for k in range(640)][7::8]
+    assert [0, 1] in many
+    assert np.mean([a == b for a, b in zip(many, few, strict=True)]) > 0.9
+
+
+@pytest.mark.parametrize("hz", [10.0, 20.0, 50.0])
+def test_a_pressed_pad_whose_contact_breaks_is_not_valid_and_the_others_stay_so(hz: float):
+    """Levels as far apart as those of recorded real skin, beyond the 60 units that are known."""
+    rig = Rig(1, 0.3, seed=5, hz=hz)
+    use_own_curves(rig, 4.0)
+    rng = np.random.default_rng(1)
+    pressed, broken = np.arange(rig.n) < 12, np.arange(rig.n) == 3
+    for _ in range(round(20.0 * hz)):
+        off = 14.0 + rng.choice([-20.0, 0.0, 0.0, 20.0])
+        frame = rig.step(np.where(pressed, 48.0, 0.0) + np.where(broken, off, 0.0))
+    assert np.flatnonzero(~frame.valid).tolist() == [3]

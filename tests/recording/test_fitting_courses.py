@@ -1,0 +1,127 @@
+"""What a course of pressure cannot show is not kept: it is refused, or named."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from skin_host.config.settings import load
+from skin_host.daemon.calibrate import calibration_path
+from skin_host.processing.curves import CurveVerdict
+from skin_host.recording.load_table import LoadTable, without_spikes
+from tests.support.limbs import ARM, HZ, PADS, calibrate, ramp, stored, write_config, write_log
+
+Floats = NDArray[np.float64]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    return write_config(tmp_path)
+
+
+def table_of(bench: Path, kpa: Floats) -> Path:
+    path = bench.with_name("course.csv")
+    np.savetxt(path, np.column_stack([np.arange(len(kpa)) / HZ, kpa]), delimiter=",")
+    return path
+
+
+def test_a_recording_that_begins_pressed_is_refused_by_what_its_table_shows(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units, table = ramp(bench)
+    kpa = np.loadtxt(table, delimiter=",")[:, 1]
+    begun = round(28.0 * HZ)
+    log = write_log(bench.with_name("air.log"), units[begun:])
+    capsys.readouterr()
+    assert calibrate(bench, log, table_of(bench, kpa[begun:])) == 2
+    error = capsys.readouterr().err
+    assert "the first 5 s of the recording, of which the zero is taken, are at 40 to 46" in error
+    assert not calibration_path(load(bench), "main").exists()
+
+
+def test_a_recording_that_is_pressed_while_its_zero_is_taken_is_refused(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units, table = ramp(bench)
+    kpa = np.loadtxt(table, delimiter=",")[:, 1]
+    begun = round(11.0 * HZ)
+    log = write_log(bench.with_name("air.log"), units[begun:])
+    assert calibrate(bench, log, table_of(bench, kpa[begun:])) == 2
+    assert "are at 6 to 15 kPa; wanted untouched skin then" in capsys.readouterr().err
+
+
+def test_a_chamber_that_rests_at_some_kpa_is_untouched(bench: Path) -> None:
+    units, table = ramp(bench)
+    kpa = np.loadtxt(table, delimiter=",")[:, 1]
+    log = write_log(bench.with_name("air.log"), units)
+    assert calibrate(bench, log, table_of(bench, kpa + 6.0)) == 0
+
+
+def test_a_course_that_fits_less_than_half_of_the_pads_is_refused(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units, table = ramp(bench)
+    wander = 9.0 * np.sin(np.arange(len(units)) / HZ / 2.0)
+    wandering = np.arange(2 * PADS) % 3 > 0
+    units += np.where(wandering & (units > 12.0), wander[:, np.newaxis], 0.0)
+    log = write_log(bench.with_name("air.log"), units)
+    assert calibrate(bench, log, table) == 2
+    assert "16 of 48 pads of the pressed boards can be fitted" in capsys.readouterr().err
+    assert not calibration_path(load(bench), "main").exists()
+
+
+def test_the_hysteresis_of_a_foam_that_is_not_let_go_is_not_known(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units, table = ramp(bench)
+    up = round(48.0 * HZ)
+    log = write_log(bench.with_name("air.log"), units[:up])
+    assert calibrate(bench, log, table) == 0
+    answer = capsys.readouterr()
+    assert "hysteresis of the foam: not known" in answer.out
+    assert "expected error of the good while loading" in answer.out
+    (line,) = answer.err.splitlines()
+    assert "pressures that go down read too high" in line
+    assert calibrate(bench, log, table, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["hysteresis_known"] is False
+
+
+def test_pads_that_a_weak_course_does_not_show_keep_their_curves(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units, table = ramp(bench)
+    kpa = np.loadtxt(table, delimiter=",")[:, 1]
+    assert calibrate(bench, write_log(bench.with_name("air.log"), units), table) == 0
+    kept = calibration_path(load(bench), "main")
+    before = stored(bench, kept)
+    weak = 0.2 * units
+    weak[:, :5] = 0.0
+    log = write_log(bench.with_name("weak.log"), weak, seed=7)
+    capsys.readouterr()
+    assert calibrate(bench, log, table_of(bench, 0.25 * kpa)) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("warning: taxels 0-4 of arm: moved too little in ")
+    after = stored(bench, kept)
+    assert before.curves is not None
+    assert after.curves is not None
+    assert np.array_equal(after.curves.kpa[:5], before.curves.kpa[:5])
+    assert not np.array_equal(after.curves.kpa[5:], before.curves.kpa[5:])
+    assert after.curves.memory == before.curves.memory
+    assert (after.curves.verdict[ARM] == CurveVerdict.GOOD).all()
+
+
+def test_spikes_of_a_table_are_left_out_and_its_steps_are_not() -> None:
+    time_s = np.arange(0.0, 20.0, 0.02)
+    kpa = np.where(time_s < 10.0, 5.0, 60.0)
+    spiky = kpa.copy()
+    spiky[[100, 101, 400, 700, 701]] += 20.0
+    table = without_spikes(LoadTable(Path("air.csv"), time_s, spiky))
+    assert table.kpa.tolist() == kpa.tolist()
+    assert table.time_s.tolist() == time_s.tolist()
+
+
+def test_two_lines_of_a_table_are_no_spikes() -> None:
+    table = LoadTable(Path("air.csv"), np.array([0.0, 60.0]), np.array([0.0, 80.0]))
+    assert without_spikes(table).kpa.tolist() == [0.0, 80.0]
