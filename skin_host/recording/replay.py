@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from skin_host.bus.logs import WINDOW_NS, channel_names, name_in, read_channels
+from skin_host.bus.logs import (
+    MOST_CHANNELS,
+    WINDOW_NS,
+    channel_names,
+    name_in,
+    read_channels,
+)
 from skin_host.bus.wire import FrameBatch, in_slices
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import LogError, RequestError, SkinError, required
@@ -40,6 +46,8 @@ if TYPE_CHECKING:
 
 #: A recording without a calibration file begins with this time of untouched skin.
 UNTOUCHED_S = 5.0
+#: Of more channels only so many are named.
+MOST_NAMED = 20
 #: A scheduler that does not answer within this time counts as absent.
 SCHEDULER_S = 10.0
 #: The frames of an only bus are in the recording's order, however long its batches are.
@@ -99,6 +107,8 @@ def _only_channel(log: Path, settings: Settings) -> str | None:
         if name in wanted:
             return name
         seen.add(name)
+    if len(seen) >= MOST_CHANNELS:
+        return None  # no recording has so many: reading it reports the damage
     if len(seen) > 1:
         raise _other_channels(log, seen, settings)
     return next(iter(seen), None)
@@ -117,8 +127,11 @@ def _names(log: Path) -> Iterator[str]:
 
 def _other_channels(log: Path, seen: set[str], settings: Settings) -> LogError:
     """Return the error of a recording without the channel of any bus."""
+    listed = sorted(seen)[:MOST_NAMED]
+    if len(seen) > len(listed):
+        listed.append(f"... ({len(seen)} in all)")
     return LogError(
-        f"{log}: its channels are {', '.join(sorted(seen)) or 'unnamed'}; "
+        f"{log}: its channels are {', '.join(listed) or 'unnamed'}; "
         f"the configuration's are {', '.join(bus.channel for bus in settings.buses.values())}"
     )
 
