@@ -176,11 +176,11 @@ def main(port: str = "1883", name: str = "subscriber-example") -> None:
     session = Properties(PacketTypes.CONNECT)
     session.SessionExpiryInterval = AWAY_S
     try:
-        client.connect("localhost", int(port), clean_start=False, properties=session)
-    except OSError as error:
-        sys.exit(f"localhost:{port}: {error}; is a broker running there?")
-    client.loop_start()
-    try:
+        try:
+            client.connect("localhost", int(port), clean_start=False, properties=session)
+        except OSError as error:
+            sys.exit(f"localhost:{port}: {error}; is a broker running there?")
+        client.loop_start()
         watch()
     except KeyboardInterrupt:
         pass

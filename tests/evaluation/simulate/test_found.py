@@ -573,17 +573,17 @@ def test_a_press_just_before_a_zero_is_in_it_also_where_something_lay_on_the_pad
         runner.run(live())
 
 
-@pytest.mark.parametrize("decides_kpa", [0.1, 100.0])
+@pytest.mark.parametrize("felt_kpa", [0.1, 100.0])
 def test_a_press_that_noisy_pads_had_not_felt_is_in_the_zero_of_their_board(
-    world: World, decides_kpa: float, monkeypatch: pytest.MonkeyPatch
+    world: World, felt_kpa: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They detect it only if it is firmer, or lasts for longer than a second."""
 
     async def live() -> None:
         promises, life = start_watched(world)
         await world.clock.sleep(12.0)
-        levels = np.full(world.layout.n_taxels, decides_kpa)
-        monkeypatch.setattr(promises._truth, "decides_kpa", levels)
+        levels = np.full(world.layout.n_taxels, felt_kpa)
+        monkeypatch.setattr(promises._truth, "felt_kpa", levels)
         promises.sample()
         pressing = asyncio.create_task(world.spots[0].press(8.0, 50.0), name="press")
         for _ in range(8):
@@ -594,7 +594,7 @@ def test_a_press_that_noisy_pads_had_not_felt_is_in_the_zero_of_their_board(
         assert not promises.excuses.exempt.any()
         await life.daemon.configure()
         promises.sample()
-        assert promises.excuses.exempt[pressed].all() == (decides_kpa > 50.0)
+        assert promises.excuses.exempt[pressed].all() == (felt_kpa > 50.0)
         pressing.cancel()
         life.kill()
 
