@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(slots=True)
-class Contact:
+class Followed:
     """A contact as it is followed; all times are those of `PressureFrame.elapsed_ns`.
 
     Attributes:
@@ -48,7 +48,7 @@ class Homes:
     #: A group of more is taken as an array.
     _MANY = 48
 
-    def __init__(self, contacts: dict[int, Contact], n: int) -> None:
+    def __init__(self, contacts: dict[int, Followed], n: int) -> None:
         self._names = np.zeros(n, np.int64)
         for name, contact in contacts.items():
             self._names[contact.order] = name

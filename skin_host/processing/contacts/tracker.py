@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from skin_host.config.settings import Settings
 from skin_host.layout import Layout
 from skin_host.processing.contacts.former import Decision, Former
-from skin_host.processing.contacts.grouping import Contact, Grouping, Homes
+from skin_host.processing.contacts.grouping import Followed, Grouping, Homes
 from skin_host.processing.contacts.held import Held
 from skin_host.processing.contacts.neighbours import Near, Unfelt
 from skin_host.processing.contacts.places import Places
@@ -77,7 +77,7 @@ class ContactTracker:
         self._places: Places | None = None
         if settings.parts[part.name].localization != "centroid":
             self._places = Places(layout, part_index, settings, near.pitch_m)
-        self._contacts: dict[int, Contact] = {} if before is None else before._contacts
+        self._contacts: dict[int, Followed] = {} if before is None else before._contacts
         self._next_id: int = 1 if before is None else before._next_id
         self._elapsed_ns: int = 0 if before is None else before._elapsed_ns
         self._held: Held = Held(part.n_taxels) if before is None else before._held
@@ -398,7 +398,7 @@ class ContactTracker:
             events.append(event)
             if known is None:
                 own = found.order[found.spans[number]]
-                self._contacts[name] = Contact(taxels, own, event, now_ns, peak)
+                self._contacts[name] = Followed(taxels, own, event, now_ns, peak)
             else:
                 known.reported, known.reported_ns = event, now_ns
         return events
