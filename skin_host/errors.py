@@ -19,7 +19,7 @@ probably meant. `required` imports an extra, or raises.
 """
 
 import importlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 
@@ -89,6 +89,14 @@ def visible(text: str, longest: int = 1000) -> str:
 def visible_lines(text: str) -> str:
     """Return whole text of several lines, such as a traceback, each as `visible` shows it."""
     return "\n".join(visible(line, len(line)) for line in text.split("\n"))
+
+
+def some_of(names: Sequence[str], most: int = 20) -> str:
+    """Return names as a list in words; of more than so many only the first, and how many."""
+    listed = list(names[:most])
+    if len(names) > len(listed):
+        listed.append(f"... ({len(names)} in all)")
+    return ", ".join(listed)
 
 
 def nearest(typed: str, known: Iterable[str]) -> str | None:

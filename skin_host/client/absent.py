@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping
 
 from skin_host.client.heard import Described
-from skin_host.errors import visible
+from skin_host.errors import some_of, visible
 
 #: Of more parts only so many are named.
 MOST_NAMED = 20
@@ -11,13 +11,8 @@ MOST_NAMED = 20
 
 def no_such_part(robot: str, part: str, names: Collection[str]) -> str:
     """Return that a robot has no such part, and which ones it has."""
-    listed = [visible(name, 64) for name in sorted(names)[:MOST_NAMED]]
-    if len(names) > len(listed):
-        listed.append(f"... ({len(names)} in all)")
-    return (
-        f'robot "{robot}" has no part "{visible(part, 64)}"; there are: '
-        f"{', '.join(listed) or 'none'}"
-    )
+    listed = some_of([visible(name, 64) for name in sorted(names)], MOST_NAMED)
+    return f'robot "{robot}" has no part "{visible(part, 64)}"; there are: {listed or "none"}'
 
 
 def unpublished(

@@ -22,7 +22,14 @@ from skin_host.daemon.control import Control
 from skin_host.daemon.lasting import LastingTouches
 from skin_host.daemon.link import Link, OpenPort
 from skin_host.daemon.memory import NodeMemory, remembered_with
-from skin_host.daemon.state import NodeState, Thresholds, Zeros, kept_path, taxels_of
+from skin_host.daemon.state import (
+    NodeState,
+    Thresholds,
+    Zeros,
+    baselines_of,
+    kept_path,
+    taxels_of,
+)
 from skin_host.errors import ConfigurationError, RequestError, SkinError, StateError
 from skin_host.files import refuse_other_robot, write_document
 from skin_host.fingertip.health import FingertipRecord
@@ -566,11 +573,8 @@ class Daemon:
         """Continue from the baselines that were kept: boards send with these zeros."""
         pipeline = self.engine.pipeline
         assert pipeline is not None
-        for part in self.layout.parts:
-            kept = self._zeros.baselines.get(part.name, ())
-            if len(kept) == part.n_taxels:
-                taxels = np.arange(part.start, part.stop, dtype=np.int32)
-                pipeline.set_zero(taxels, np.array(kept))
+        for part, kept in baselines_of(self.layout, self._zeros.baselines):
+            pipeline.set_zero(np.arange(part.start, part.stop, dtype=np.int32), kept)
 
     def _baselines(self) -> dict[str, list[float]]:
         pipeline = self.engine.pipeline

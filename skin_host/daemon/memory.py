@@ -19,7 +19,15 @@ import numpy as np
 from skin_host.config.settings import Settings
 from skin_host.daemon import service
 from skin_host.daemon.calibrate import stored_calibration
-from skin_host.daemon.state import NodeState, Zeros, is_there, kept_path, load_kept, taxels_of
+from skin_host.daemon.state import (
+    NodeState,
+    Zeros,
+    baselines_of,
+    is_there,
+    kept_path,
+    load_kept,
+    taxels_of,
+)
 from skin_host.errors import OtherRobotError, OtherSkinError
 from skin_host.files import write_document
 from skin_host.layout import Layout, PadKind, PartLayout, parts_of
@@ -163,9 +171,8 @@ def known_of(calibration: Calibration, zeros: Zeros, layout: Layout) -> Known:
     board has taken what touched them into its zero.
     """
     baseline = calibration.baseline.copy()
-    for part in layout.parts:
-        kept = zeros.baselines.get(part.name, ()) if zeros.are_of(calibration.id) else ()
-        if len(kept) == part.n_taxels:
+    if zeros.are_of(calibration.id):
+        for part, kept in baselines_of(layout, zeros.baselines):
             baseline[part.start : part.stop] = kept
     doubted = taxels_of(layout, zeros.unknown) | taxels_of(layout, zeros.touched)
     return Known(calibration, baseline, ~doubted)

@@ -7,7 +7,7 @@ and reported, so that the service can always start.
 
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, TypeVar
@@ -21,7 +21,7 @@ from skin_host.config.fields import Name
 from skin_host.config.settings import Settings, TouchSettings, changed
 from skin_host.daemon import service
 from skin_host.files import read_document, refuse_other_robot, set_aside, why_unreadable
-from skin_host.layout import Layout
+from skin_host.layout import Layout, PartLayout
 
 log = logging.getLogger(__name__)
 
@@ -122,6 +122,16 @@ def taxels_of(layout: Layout, numbers: Mapping[str, list[int]]) -> NDArray[np.bo
             if 0 <= taxel < part.n_taxels:
                 found[part.start + taxel] = True
     return found
+
+
+def baselines_of(
+    layout: Layout, baselines: Mapping[str, list[float]]
+) -> Iterator[tuple[PartLayout, NDArray[np.float64]]]:
+    """Yield the parts of which baselines [m] were kept, as far as they are of this skin."""
+    for part in layout.parts:
+        kept = baselines.get(part.name, ())
+        if len(kept) == part.n_taxels:
+            yield part, np.array(kept)
 
 
 Kept = TypeVar("Kept", NodeState, Zeros)

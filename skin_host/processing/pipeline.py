@@ -428,12 +428,10 @@ class _PartPipeline:
             self._called = self._felt
         elif self._called is self._felt:
             self._called = self._felt.copy()
-        self._felt.use(rules.felt, votes)
-        if self._called is not self._felt:
-            self._called.use(rules.levels, votes)
-        self._decisions = [self._felt]
-        if self._called is not self._felt:
-            self._decisions.append(self._called)
+        is_one = self._called is self._felt
+        self._decisions = [self._felt] if is_one else [self._felt, self._called]
+        for decision, found in zip(self._decisions, (rules.felt, rules.levels), strict=False):
+            decision.use(found, votes)
         self._nothing = [self._nowhere] * len(self._decisions)
 
     def _adopt(self, rules: _Rules) -> None:

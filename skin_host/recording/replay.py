@@ -26,7 +26,7 @@ from skin_host.bus.logs import (
 )
 from skin_host.bus.wire import FrameBatch, in_slices
 from skin_host.config.settings import Settings, skin_hash
-from skin_host.errors import LogError, RequestError, SkinError, required
+from skin_host.errors import LogError, RequestError, SkinError, required, some_of
 from skin_host.files import whole_file
 from skin_host.health import HealthWatch
 from skin_host.health.diagnosis import named_by_part
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 
 #: A recording without a calibration file begins with this time of untouched skin.
 UNTOUCHED_S = 5.0
-#: Of more channels only so many are named.
-MOST_NAMED = 20
 #: A scheduler that does not answer within this time counts as absent.
 SCHEDULER_S = 10.0
 #: The frames of an only bus are in the recording's order, however long its batches are.
@@ -127,11 +125,8 @@ def _names(log: Path) -> Iterator[str]:
 
 def _other_channels(log: Path, seen: set[str], settings: Settings) -> LogError:
     """Return the error of a recording without the channel of any bus."""
-    listed = sorted(seen)[:MOST_NAMED]
-    if len(seen) > len(listed):
-        listed.append(f"... ({len(seen)} in all)")
     return LogError(
-        f"{log}: its channels are {', '.join(listed) or 'unnamed'}; "
+        f"{log}: its channels are {some_of(sorted(seen)) or 'unnamed'}; "
         f"the configuration's are {', '.join(bus.channel for bus in settings.buses.values())}"
     )
 
