@@ -10,7 +10,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo docs test quick coverage mutation test-system test-lane test-containers simulate install uninstall lint format clean
+.PHONY: help demo docs test quick coverage mutation test-system test-real-time test-beside test-native test-long test-lane test-containers simulate install uninstall lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -42,16 +42,29 @@ mutation: .venv/dev.stamp .venv/mutation.stamp  ## small changes of the core tha
 test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, systemd, broker and browser; root, if packages are missing
 	@tools/timed "packages" tools/lane/packages
 	@$(BIN)/python -m compileall -q skin_host emulator tests
-	@tools/timed "on this host: broker, browser, the lane itself" \
-		$(BIN)/python -m pytest tests/system/native --require-mosquitto $(AGAIN)
-	@tools/timed "on this host: the other tests with a broker, which wait, and the long ones, which compute" \
-		$(BIN)/python -m pytest tests -m "mosquitto or long or hypothesis" --hypothesis-profile=far \
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target test-real-time test-beside
+
+# What runs in real time, and beside it what computes, which gives way to it, and other machines.
+test-real-time: test-native
+	@tools/timed "on this host: the other tests with a broker" \
+		$(BIN)/python -m pytest tests -m mosquitto --hypothesis-profile=far \
 		--require-mosquitto $(BY_FILE) $(AGAIN)
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target test-lane test-containers
+	@$(MAKE) --no-print-directory test-lane
+
+test-beside: test-long
+	@$(MAKE) --no-print-directory test-containers
 	@tools/timed "a Debian that boots: systemd and CAN cards" \
 		$(BIN)/python -m pytest tests/system/systemd --numprocesses=2 --dist=loadfile $(AGAIN)
 
-# The lane's machine has one processor: meanwhile the other makes a disk and an image.
+test-native: .venv/dev.stamp .venv/fuzz.stamp
+	@tools/timed "on this host: broker, browser, the lane itself" \
+		$(BIN)/python -m pytest tests/system/native --require-mosquitto $(AGAIN)
+
+test-long: .venv/dev.stamp
+	@tools/timed "on this host: what computes for long" nice -n 19 \
+		$(BIN)/python -m pytest tests -m "(long or hypothesis) and not mosquitto" \
+		--hypothesis-profile=far --numprocesses=2 --dist=loadfile --no-loadscope-reorder $(AGAIN)
+
 test-lane: .venv/dev.stamp
 	@tools/timed "in the lane: vcan and CUSE" \
 		tools/lane/run $(BIN)/python -m pytest tests/stack tests/system/lane \

@@ -21,17 +21,24 @@ _numbers = itertools.count()
 
 #: Fixtures that start a broker: for one test, and for all pages of the documentation.
 BROKERS = {"mosquitto", "world"}
-#: Files that take more than five seconds, as `--durations=0` found them.
+#: Files that take longest, by the clock or by the processor.
 LONGEST_FIRST = (
     "tests/evaluation/simulate/test_simulate.py",
+    "tests/processing/test_long_contact.py",
     "tests/attacks/test_hostile_bus.py",
     "tests/cli/test_running_commands.py",
-    "tests/processing/test_long_contact.py",
+    "tests/recording/test_fitting.py",
+    "tests/evaluation/simulate/test_truth.py",
     "tests/mqtt/test_rejected.py",
     "tests/docs/test_pages.py",
     "tests/daemon/test_daemon_contact.py",
+    "tests/daemon/test_lasting_touches.py",
+    "tests/evaluation/simulate/test_found.py",
+    "tests/processing/test_pipeline.py",
+    "tests/daemon/test_stepped_daemon.py",
     "tests/stack/test_three_presses.py",
     "tests/stack/test_fingertips.py",
+    "tests/attacks/test_files_that_change.py",
     "tests/attacks/test_daemon_under_attack.py",
     "tests/examples/test_gripper.py",
     "tests/cli/test_demo.py",
@@ -39,12 +46,16 @@ LONGEST_FIRST = (
     "tests/client/test_fleet.py",
     "tests/evaluation/test_accuracy_report.py",
     "tests/daemon/test_slow_disk.py",
+    "tests/daemon/test_daemon_boards.py",
+    "tests/emulator/boards/test_fingertips.py",
     "tests/evaluation/test_rig_report.py",
     "tests/mqtt/test_publisher.py",
-    "tests/recording/test_fitting.py",
-    "tests/daemon/test_stepped_daemon.py",
+    "tests/daemon/test_daemon_pitfalls.py",
+    "tests/fingertip/test_boards.py",
+    "tests/emulator/test_robot.py",
+    "tests/evaluation/test_force_trials.py",
+    "tests/attacks/test_hostile_surroundings.py",
     "tests/evaluation/papers/test_contacts_report.py",
-    "tests/processing/test_pipeline.py",
 )
 
 # A slow machine is no failure.

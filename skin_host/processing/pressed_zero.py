@@ -37,7 +37,7 @@ class PressedZero:
         lifted: bool[n], the others of them.
     """
 
-    def __init__(self, pressed: Mask, no_load: float, noise: Floats, repeats: float = 1.0) -> None:
+    def __init__(self, pressed: Mask, no_load: float, noise: Floats, repeats: float) -> None:
         self.pressed: Mask = pressed.copy()
         self.lifted: Mask = np.zeros_like(pressed)
         self._no_load = no_load

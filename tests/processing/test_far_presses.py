@@ -87,6 +87,7 @@ class Skin:
             )
             self.finds.note(0, sweep, touched, self.now_ns)
             assert not found[np.arange(16) != TRIANGLE].any()
+            assert not (found & ~self.finds.pressed(0)).any()
             # What is found pressed is touched, and nothing else that is far is.
             self.touched = (self.touched & ~self.far) | found[TRIANGLE]
         return np.flatnonzero(found[TRIANGLE]).tolist()

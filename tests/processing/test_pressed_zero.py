@@ -19,17 +19,20 @@ def zero(noise: float = 0.6, repeats: float = 1.0) -> PressedZero:
     return PressedZero(pressed, NO_LOAD, np.full(3, noise), repeats)
 
 
-def send(of: PressedZero, sweeps: int, *units: int, here: np.ndarray = ALL) -> None:
-    """Send what three pads read, in units of pressure."""
+def send(of: PressedZero, sweeps: int, *units: int, here: np.ndarray = ALL) -> bool:
+    """Send what three pads read, in units of pressure; return whether the last sweep turned any."""
+    turned = False
     for _ in range(sweeps):
-        of.step((NO_LOAD - np.array(units)).clip(0, 255).astype(np.uint8), here)
+        turned = of.step((NO_LOAD - np.array(units)).clip(0, 255).astype(np.uint8), here)
+    return turned
 
 
 def test_what_reads_below_its_zero_has_lifted() -> None:
     found = zero()
-    send(found, BELOW_SWEEPS - 1, -15, 0, -15)
+    assert not send(found, BELOW_SWEEPS - 1, -15, 0, -15)
     assert found.pressed.tolist() == [True, True, False]
-    send(found, 1, -15, 0, -15)
+    assert send(found, 1, -15, 0, -15)
+    assert not send(found, 1, -15, 0, -15)
     assert found.pressed.tolist() == [False, True, False]
     assert found.lifted.tolist() == [True, False, False]
 
@@ -68,6 +71,7 @@ def test_what_the_noise_of_the_zero_explains_is_no_release(
     lowest = max(lowest, -14)  # below is the end of the scale
     for unit in data.draw(st.lists(st.integers(lowest, 40), max_size=60)):
         send(found, 1, unit, unit, unit)
+    send(found, BELOW_SWEEPS, lowest, lowest, lowest)
     assert found.pressed.tolist() == [True, True, False]
     send(found, BELOW_SWEEPS, lowest - 1, 0, 0)
     assert found.lifted.tolist() == [True, False, False]

@@ -185,6 +185,20 @@ def looked_at() -> Scatter:
     raise AssertionError
 
 
+@pytest.mark.parametrize("together", [2, 3, 5])
+def test_a_pad_is_found_as_soon_however_many_samples_are_looked_at_together(together: int):
+    rows = scattering(np.random.default_rng(4), 400)
+
+    def found_after(count: int) -> int:
+        scatter = Scatter(np.full(2, STEP_KPA, np.float32), np.full(2, RANGE_KPA, np.float32))
+        for begin in range(0, 400, count):
+            if look(scatter, rows[begin : begin + count]):
+                return begin + count
+        raise AssertionError
+
+    assert abs(found_after(together) - found_after(1)) < together
+
+
 def test_a_new_zero_and_a_pause_forget_what_was_read():
     rows = scattering(np.random.default_rng(2), 4)
     for taxels, left in (([True, False], [1]), ([False, False], [0, 1]), ([True, True], [])):

@@ -204,6 +204,7 @@ WRONG: dict[str, tuple[Callable[[Patch], None], Path, int, float, str]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_wrong_in_all_numbers_alike_breaks_a_promise(name: str, monkeypatch: Patch) -> None:
     plant, config, seed, until_s, promise = WRONG[name]
@@ -211,6 +212,7 @@ def test_what_is_wrong_in_all_numbers_alike_breaks_a_promise(name: str, monkeypa
     assert promise in outcome(config, seed, until_s)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("config", "seed", "until_s"), sorted({one[1:4] for one in WRONG.values()})
 )

@@ -173,7 +173,8 @@ async def test_a_clock_that_is_set_by_an_hour_costs_a_sweep_at_most_and_accuses_
                 seen |= {fault["code"] for fault in record["faults"]}
                 shares.append(record["valid_taxels"] / record["taxels"])
         # A burst that was on its way when the clock was set is the only loss.
-        assert seen <= OWN | {"broker_away", "bus_loses_frames"}
+        # A computer that others share may stall by itself meanwhile.
+        assert seen <= OWN | {"broker_away", "bus_loses_frames", "host_stalls"}
         assert min(shares) > MOST
         for one in daemon.engine.assemblers.values():
             assert one.counters.incomplete <= 2
