@@ -12,7 +12,6 @@ import tempfile
 from collections import Counter
 from collections.abc import AsyncIterator
 from importlib.metadata import files
-from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,7 @@ import numpy as np
 from msgspec import structs
 
 from skin_host import emulator_path
-from skin_host.bus.pair import PAIR, PairBus, pair
+from skin_host.bus.pair import PAIR, PairBus, hand_over, pair
 from skin_host.cli.lines import event_line
 from skin_host.client import SkinClient
 from skin_host.config.settings import Bus, Mqtt, Settings, changed
@@ -29,7 +28,7 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.errors import ConfigurationError, SkinError
 from skin_host.layout import Layout, PadKind, build_layout, load_skin
 from skin_host.mqtt.broker import LocalBroker, local_broker
-from skin_host.processes import kept_from_children
+from skin_host.processes import OF_TERMINALS, kept_from_children, start_tracker
 from skin_host.tasks import cancel
 from skin_host.viewer.server import Viewer
 
@@ -259,15 +258,14 @@ async def _robot(
     for name, bus in settings.buses.items():
         if bus.interface == "virtual":
             ours, ends[name] = pair()
-            channel = str(ours.detach())
-            buses[name] = Bus(interface=PAIR, channel=channel, bitrate=bus.bitrate)
+            buses[name] = Bus(interface=PAIR, channel=hand_over(ours), bitrate=bus.bitrate)
     spawn = multiprocessing.get_context("spawn")
     ready, told = spawn.Pipe(duplex=False)
     process = spawn.Process(
         target=_live, args=(settings, layout, scene, mujoco, ends, told), daemon=True
     )
-    ensure_running()
-    with kept_from_children(signal.SIGINT, signal.SIGTERM):
+    start_tracker()
+    with kept_from_children(*OF_TERMINALS, signal.SIGTERM):
         process.start()
     told.close()
     for end in ends.values():

@@ -637,6 +637,34 @@ def refuse_input(output: Path | None, *inputs: Path | None) -> None:
                     raise RequestError(f"{output}: is read by this command; choose another name")
 
 
+def check_output(output: Path, *, folder: bool = False) -> None:
+    """Check before long work that its result can be written, as far as that can be known then.
+
+    Args:
+        output: where to write.
+        folder: it is to be a folder of files.
+
+    Raises:
+        RequestError: there is a folder where a file is wanted, or the reverse.
+        SkinError: it lies where nothing can be written.
+    """
+    with writing(output), _naming(output):
+        place = output.absolute()
+        if not folder:
+            file = _file_at(_end_of(output))
+            if file is None:
+                return  # a device, a pipe, or what is open
+            place = file.absolute().parent
+        while not os.path.lexists(place):
+            place = place.parent
+        if folder and place == output.absolute() and not place.is_dir():
+            raise RequestError(f"{output}: is a file; wanted a folder")
+        if not place.is_dir():
+            raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(place))
+        if not os.access(place, os.W_OK | os.X_OK):
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(place))
+
+
 def write_together(
     files: Iterable[tuple[Path, bytes]], made_from: Sequence[Path] = ()
 ) -> list[Path]:

@@ -7,9 +7,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from multiprocessing.resource_tracker import ensure_running
 from types import TracebackType
 from typing import Any, TypeVar, TypeVarTuple, Unpack
@@ -21,6 +23,8 @@ Ts = TypeVarTuple("Ts")
 
 #: A process that is to end has so long to clean up.
 AGAIN_S = 2.0
+#: A terminal sends these to all processes that were started in it: Ctrl-C, and that it is closed.
+OF_TERMINALS = (signal.SIGINT, signal.SIGHUP)
 #: From linux/prctl.h.
 _PR_SET_PDEATHSIG = 1
 
@@ -48,7 +52,7 @@ class Processes:
     """
 
     def __init__(self, most: int | None = None) -> None:
-        ensure_running()
+        start_tracker()
         self._pool = ProcessPoolExecutor(
             cores() if most is None else min(cores(), most),
             multiprocessing.get_context("spawn"),
@@ -60,7 +64,7 @@ class Processes:
 
     def submit(self, function: Callable[[Unpack[Ts]], T], *arguments: *Ts) -> "Future[T]":
         """Call a function, which can be pickled, in one of the processes."""
-        with kept_from_children(signal.SIGINT):  # the first call starts them
+        with kept_from_children(*OF_TERMINALS):  # the first call starts them
             return self._pool.submit(_work, function, arguments)
 
     def __enter__(self) -> "Processes":
@@ -86,13 +90,53 @@ class Processes:
             ) from None
 
 
+def start_tracker() -> None:
+    """Start the process in which `multiprocessing` tracks what is to be removed at the end.
+
+    It survives a terminal that is closed: the next one would not know what it has to remove.
+    """
+    with kept_from_children(signal.SIGHUP):
+        ensure_running()
+
+
+@contextlib.contextmanager
+def beside(processes: Sequence[BaseProcess], *ends: Connection) -> Iterator[None]:
+    """Run processes for as long as the block lasts; signals of a terminal do not reach them.
+
+    Args:
+        processes: not started yet.
+        ends: of pipes, that only these processes need. They are closed here, so that who waits at
+            the other end learns that its process has ended.
+
+    Raises:
+        SkinError: in place of the EOFError that this is.
+    """
+    start_tracker()
+    started: list[BaseProcess] = []
+    try:
+        with kept_from_children(*OF_TERMINALS):
+            for process in processes:
+                process.start()
+                started.append(process)
+        for end in ends:
+            end.close()
+        yield
+    except EOFError:
+        raise SkinError("a process of this work has ended; its error stands above") from None
+    finally:
+        for process in started:
+            process.terminate()
+        for process in started:
+            process.join()
+
+
 @contextlib.contextmanager
 def kept_from_children(*numbers: signal.Signals) -> Iterator[None]:
     """Programs that are started in the block do not receive these signals, unless they unblock
     them: a terminal sends Ctrl-C to all of them, but this process ends by it, and then ends them.
 
     What comes meanwhile reaches this process after the block. The first start of a process by
-    `multiprocessing` unblocks SIGINT and SIGTERM (Python 3.11): call `ensure_running` before.
+    `multiprocessing` unblocks SIGINT and SIGTERM (Python 3.11): call `start_tracker` before.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:

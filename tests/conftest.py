@@ -114,6 +114,16 @@ def _place(file: str) -> int:
     return LONGEST_FIRST.index(file) if file in LONGEST_FIRST else len(LONGEST_FIRST)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def kept_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What is kept where no configuration names a folder is neither the user's nor that of tests
+    that run at the same time: one node of a name runs in a folder.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture
 def bus_kind(request: pytest.FixtureRequest) -> str:
     """The kind of CAN bus: `virtual` (one process) or `vcan` (any number of processes)."""

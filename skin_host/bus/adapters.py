@@ -53,6 +53,17 @@ OPEN_S = 5.0
 CLOSE_S = 1.0
 #: A server of buses greets within this time.
 GREETING_S = 2.0
+#: Extras of python-can, by the interface that needs one.
+_EXTRAS = {
+    "canalystii": "canalystii",
+    "cantact": "cantact",
+    "gs_usb": "gs-usb",
+    "neovi": "neovi",
+    "robotell": "serial",
+    "seeedstudio": "seeedstudio",
+    "serial": "serial",
+    "slcan": "serial",
+}
 #: Stands for a frame that the adapter's library could not read.
 _UNREADABLE = can.Message()
 #: Options of Linux sockets (in.h, in6.h) that Python does not name.
@@ -347,6 +358,11 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
         if settings.interface == MULTICAST and find_spec("msgpack") is None:
             why = "the package msgpack is not installed; mend it with: "
             why += "pip install 'skin-host[multicast]'"
+        elif isinstance(error, can.CanInterfaceNotImplementedError | ImportError):
+            extra = _EXTRAS.get(settings.interface)
+            why += f"; mend it with: pip install 'python-can[{extra}]'" if extra else ""
+        elif isinstance(error, TypeError):  # of its arguments, which are these
+            why += f"; python-can's {settings.interface} takes them from [buses.{name}.options]"
         raise BusError(f"{where}: cannot be opened: {why}") from None
     return bus
 

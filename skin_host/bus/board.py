@@ -36,6 +36,7 @@ class BoardRecord:
         claim: its last answer, if that was that it is in its bootloader or reads no skin, with
             `asked` at that time.
         claimed_ns: when such an answer was last believed.
+        set_up_otherwise: another program has set it up since, and not as this one does.
 
     Times ending in `_at_ns` or `_from_ns`, and `answered_ns`, are monotonic; the others are on the
     clock of the ledger, which stands still while the bus is not read.
@@ -61,6 +62,7 @@ class BoardRecord:
     asked: int = 0
     claim: tuple[Message, int] | None = None
     claimed_ns: int = 0
+    set_up_otherwise: bool = False
     wrong: str = ""
     wrong_since_ns: int = 0
     wrong_tries: int = 0

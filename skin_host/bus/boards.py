@@ -21,7 +21,7 @@ Properties of the firmware decide the order (reference of the wire, sections 3 a
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Protocol
@@ -113,6 +113,8 @@ class Boards:
             sent until then were those that it had been set up to send.
         clock: for waiting.
         unconfigured: frames by address of boards that are not configured, see `Assembler`.
+        configured: addresses of all boards that the configuration has on this bus, also those of
+            fingertips and of other nodes.
     """
 
     def __init__(
@@ -125,6 +127,7 @@ class Boards:
         zeroed: Callable[[int, bool], object] = lambda *_: None,
         clock: Clock = SYSTEM,
         unconfigured: Mapping[int, int] = MappingProxyType({}),
+        configured: Set[int] = frozenset(),
     ) -> None:
         self.bus = bus
         self._zeroed = zeroed
@@ -137,6 +140,7 @@ class Boards:
         #: The types of the boards that are not configured, by address.
         self.strangers: dict[int, int] = {}
         self._sent_by = unconfigured
+        self._configured = configured
         self._unconfigured: dict[int, _Unconfigured] = {}
         self._asking: asyncio.Task[None] | None = None
         self._failed = False
@@ -227,10 +231,8 @@ class Boards:
         gap_s = record.gap_s
         frames = [command_frame(command, address) for command in record.commands]
         began_ns = self._clock.monotonic_ns()
-
-        believed = record.configurations > 0 or self._is_in_use(record)
-        # By its own settings, untouched pads may read as if they were pressed.
-        believed &= not record.sends_by_itself
+        believed = self._believes(record)
+        record.set_up_otherwise = False
 
         def announced(
             zeroing: list[tuple[int, bytes]], believed: bool
@@ -263,6 +265,28 @@ class Boards:
         for question in questions:
             yield command_frame(question, record.layout.settings.address)
 
+    def note_other_host(self, address: int, command: Message) -> Iterator[tuple[int, bool]]:
+        """Note that another program on the bus sets up a board, or every one; yield the boards that
+        it gives another zero, as `zeroed` is called with them.
+        """
+        for record in self.records.values():
+            if address not in (record.layout.settings.address, BROADCAST_ADDRESS):
+                continue
+            yield record.index, self._believes(record)
+            record.set_up_otherwise |= command not in record.commands
+            self._warn(
+                record,
+                "is set up by another program on this bus, which gives it another zero: stop that "
+                "program, as one host must set up a board",
+            )
+
+    def _believes(self, record: BoardRecord) -> bool:
+        """Return whether touches of a board are believed: by settings of its own, untouched pads
+        may read as if they were pressed.
+        """
+        in_use = record.configurations > 0 or self._is_in_use(record)
+        return in_use and not record.sends_by_itself
+
     def _is_in_use(self, record: BoardRecord) -> bool:
         """Whether a board sends as one that an earlier start of the daemon has set up."""
         return self._ledger.keeps_period(record.row) is True
@@ -294,7 +318,7 @@ class Boards:
                 and record.alive
                 and record.configurations
                 and not (record.wrong or record.wrong_tries or record.claims)
-                and not record.sends_by_itself
+                and not (record.sends_by_itself or record.set_up_otherwise)
             ):
                 continue  # the usual case
             if self._ledger.overdue(record.row, record.configured_ns):
@@ -384,6 +408,8 @@ class Boards:
         elif self._ledger.keeps_period(record.row) is False:
             seen_ms = (self._ledger.regular_period_ns(record.row) or 0.0) / 1e6
             wrong = f"sends every {seen_ms:.0f} ms, not {record.layout.settings.period_ms} ms"
+        elif record.set_up_otherwise:
+            wrong = "was set up otherwise by another program"
         if wrong and not record.wrong:
             record.wrong_since_ns = now_ns
         record.wrong = wrong
@@ -494,7 +520,7 @@ class Boards:
     def _note_answer(self, address: int, answer: Message | TxOverflow) -> None:
         record = self.records.get(address)
         if record is None:
-            if isinstance(answer, Discovered):
+            if isinstance(answer, Discovered) and address not in self._configured:
                 self.strangers[address] = answer.board_type
                 ask_at_ns = self._ledger.now_ns + int(RETRY_S[-1] * 1e9)
                 frames = self._sent_by.get(address, 0)

@@ -7,15 +7,19 @@ not answer the skin configuration commands. Sources: the boards' protocol docume
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import astuple, dataclass
 from enum import IntEnum, IntFlag
 from typing import ClassVar, Self, TypeVar, dataclass_transform
 
+import numpy as np
+
 from skin_host.bus.wire import (
     HOST_ADDRESS,
     MAX_STANDARD_ID,
+    FrameBatch,
     MessageClass,
+    RecordBatch,
     identifier,
 )
 
@@ -308,3 +312,43 @@ def parse_command(can_id: int, payload: bytes) -> tuple[int, Message] | None:
             if command is not None:
                 return address, command
     return None
+
+
+#: Commands after which a board has another zero.
+ZEROING: tuple[type[Message], ...] = (
+    SetBoardConfig,
+    SetTriangleConfig,
+    TactileSetup,
+    TactileSetup2,
+)
+_ANALOG_COMMANDS = int(MessageClass.ANALOG_COMMAND) << 8 | HOST_ADDRESS << 4
+_ADDRESSES = 0xF
+
+
+def cut_where_zeroed(
+    batch: FrameBatch, zeroed: Callable[[int, Message, int], object]
+) -> Iterator[FrameBatch]:
+    """Yield a batch in pieces, cut where a host gives a board another zero.
+
+    Args:
+        batch: of one bus.
+        zeroed: called between the pieces, with the receiver (15 is everyone), the command, and its
+            time. Commands that follow each other without another frame share a place.
+    """
+    rows = np.flatnonzero(batch.id & ~np.uint32(_ADDRESSES) == _ANALOG_COMMANDS).tolist()
+    begin = 0
+    before = -1
+    whole: RecordBatch | None = None
+    for row in rows:
+        payload = batch.data[row, : batch.dlc[row]].tobytes()
+        parsed = parse_command(int(batch.id[row]), payload)
+        if parsed is None or not isinstance(parsed[1], ZEROING):
+            continue
+        if whole is None:
+            whole = RecordBatch(batch.id, batch.dlc, batch.data, batch.t_ns)
+        if row > before + 1:
+            yield whole[begin:row]
+            begin = row
+        before = row
+        zeroed(*parsed, int(batch.t_ns[row]))
+    yield batch if whole is None else whole[begin:]

@@ -531,11 +531,14 @@ def _reader(path: Path) -> "can.io.generic.MessageReader":
 
     from skin_host.bus.asc import DatedAscReader
     from skin_host.bus.blf import BoundedBlfReader
+    from skin_host.bus.sqlite import BoundedSqliteReader
 
     zipped = path.suffix.lower() == ".gz"
     kind = can.io.player.MESSAGE_READERS[_format([one.lower() for one in path.suffixes])]
     if kind is can.BLFReader:
         return BoundedBlfReader(path)
+    if kind is can.SqliteReader:
+        return BoundedSqliteReader(path)
     if not issubclass(kind, can.io.generic.TextIOMessageReader):
         return can.LogReader(path)
     file = gzip.open(path) if zipped else path.open("rb")  # noqa: SIM115  # the reader closes it

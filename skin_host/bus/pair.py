@@ -20,10 +20,12 @@ from skin_host.bus.port import LinkState, Port
 from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus
-from skin_host.errors import BusError
+from skin_host.errors import ConfigurationError
 
-#: Name of the interface; its channel is the number of an open socket of this process.
+#: Name of the interface; its channels are those that `hand_over` returns.
 PAIR = "socketpair"
+#: Ends that wait for their port in this process, by channel.
+_handed_over: dict[str, socket.socket] = {}
 #: Time of day (ns), identifier, length, data.
 FRAME = np.dtype([("t_ns", "<i8"), ("id", "<u4"), ("dlc", "u1"), ("data", "u1", (8,))])
 #: Identifier of a record that is no frame: everything up to its time has been sent.
@@ -40,6 +42,16 @@ MOST_WAITING = 20_000
 def pair() -> tuple[socket.socket, socket.socket]:
     """The two ends of a bus."""
     return socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+
+def hand_over(end: socket.socket) -> str:
+    """Return the channel by which a port of this process gets an end, once.
+
+    Any number of an open socket would do, also of one that is not ours to read.
+    """
+    channel = str(end.fileno())
+    _handed_over[channel] = end
+    return channel
 
 
 class PairBus(can.BusABC):
@@ -144,18 +156,22 @@ def _message(record: Any) -> can.Message:
 
 
 class PairPort(Port):
-    """The daemon's end: batches come as they were sent."""
+    """The daemon's end: batches come as they were sent.
+
+    Raises:
+        ConfigurationError: no end was handed over for this channel.
+    """
 
     #: Whole messages are read: one more may be added below it.
     capacity = 2 * MOST_FRAMES
 
     def __init__(self, name: str, settings: Bus, clock: Clock = SYSTEM) -> None:
-        try:
-            end = socket.socket(fileno=int(settings.channel))
-        except (ValueError, OSError) as error:
-            raise BusError(
-                f'bus "{name}": {PAIR} {settings.channel}: {error}; wanted the number of a socket'
-            ) from None
+        end = _handed_over.pop(settings.channel, None)
+        if end is None:
+            raise ConfigurationError(
+                f'bus "{name}": interface "{PAIR}" is of `skin demo` alone, which makes its own '
+                "channels; wanted another, such as socketcan or udp_multicast"
+            )
         self._pair = PairBus(end)
         self._marked_ns: int | None = None
         super().__init__(name, settings, self._pair, clock)

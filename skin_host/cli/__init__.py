@@ -29,6 +29,7 @@ from skin_host.cli import (
     watch,
     without_robot,
 )
+from skin_host.cli.common import ended_in_good_order
 from skin_host.daemon import service
 from skin_host.errors import SkinError, nearest, visible
 
@@ -185,7 +186,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()  # help
         name = f"skin {arguments.command}"
         options.check(parser.command(arguments.command), arguments)
-        status: int = arguments.run(arguments)
+        with ended_in_good_order():
+            status: int = arguments.run(arguments)
         sys.stdout.flush()
     except SkinError as error:
         _complain(f"{name}: {error}")

@@ -5,7 +5,6 @@ Recordings give the foam's relaxation and the pressure curve of each taxel.
 
 import argparse
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -28,6 +27,7 @@ from skin_host.cli.common import (
 from skin_host.cli.options import add_rules
 from skin_host.config.relaxation import FITTED
 from skin_host.errors import OtherSkinError, RequestError, visible
+from skin_host.files import check_output
 
 if TYPE_CHECKING:
     from skin_host.config.settings import Settings
@@ -136,9 +136,9 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     import asyncio
 
     from skin_host.client.serving import served_by_daemon
-    from skin_host.daemon.calibrate import take_calibration
+    from skin_host.daemon.alone import alone
+    from skin_host.daemon.calibrate import keep_former, take_calibration
     from skin_host.daemon.memory import known_of, remembered
-    from skin_host.daemon.state import Zeros
     from skin_host.layout import parts_of
     from skin_host.processing.calibration import with_pressures_of, with_zeros
     from skin_host.processing.calibration.calibrator import going_on
@@ -148,6 +148,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     set_up_logging(arguments.verbose)
     logs = arguments.relaxation, arguments.pressure
     refuse_input(arguments.output, arguments.config, *logs, arguments.load)
+    if arguments.output is not None:
+        check_output(arguments.output)
     if arguments.relaxation is not None or arguments.pressure is not None:
         return _relaxation(arguments) if arguments.relaxation is not None else _pressure(arguments)
     settings, layout = load_skin(arguments.config)
@@ -163,16 +165,19 @@ def _calibrate(arguments: argparse.Namespace) -> int:
             "calibrating beside it "
             "would zero its boards; ask it with `skin command calibrate`, or stop it"
         )
-    zeros = Zeros()
-    with suppress(OtherSkinError):
-        zeros = remembered(settings, layout, arguments.node).zeros
-    progress = Progress("calibrating, keep the skin untouched")
     try:
-        found = asyncio.run(
-            take_calibration(
-                settings, layout, parts, arguments.seconds, progress.update, touched=zeros.touched
+        zeros = remembered(settings, layout, arguments.node).zeros
+    except OtherSkinError:
+        zeros = remembered(settings, layout, arguments.node, take_new=True).zeros
+    progress = Progress("calibrating, keep the skin untouched")
+    touched = zeros.touched
+    try:
+        with alone(settings, arguments.node):
+            found = asyncio.run(
+                take_calibration(
+                    settings, layout, parts, arguments.seconds, progress.update, touched=touched
+                )
             )
-        )
     finally:
         progress.close()
     before = find_calibration(path, layout, found.configuration)
@@ -180,6 +185,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         found = going_on(found, known_of(before, zeros, layout))
         found = with_zeros(found, before.zeros | found.zeros)
         found = with_pressures_of(found, before)
+    elif arguments.output is None:
+        keep_former(path, layout, found.configuration)
     _keep(arguments, path, found, layout)
     tips = [name for name, tip in settings.fingertips.items() if tip.node == arguments.node]
     result = outcome(found, layout, parts, fingertips=tips, before=before)
@@ -493,7 +500,7 @@ def _kept(
     if found := by_part(fitted.unshown, layout):
         warn(
             f"{named_by_part(found)}: moved too little in {log} to show a curve; they keep the one "
-            "that they have"
+            "that they have, if any"
         )
     return by_part(unpressed | fitted.unshown, layout)
 

@@ -59,7 +59,9 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 def add_broker(parser: argparse.ArgumentParser) -> None:
     """Add the options to find the robot."""
     parser.add_argument("--broker", default="mqtt://localhost", metavar="URL", help="MQTT broker")
-    parser.add_argument("--robot", help="whose skin, if the broker knows several robots")
+    parser.add_argument(
+        "--robot", type=filled, help="whose skin, if the broker knows several robots"
+    )
 
 
 def positive_below(limit: float) -> Callable[[str], float]:
@@ -229,6 +231,7 @@ def ended_in_good_order() -> Iterator[None]:
     """
 
     def end(number: int, _: object) -> None:
+        _ignore_more_hangups()
         raise SystemExit(128 + number)
 
     before = {}
@@ -242,28 +245,40 @@ def ended_in_good_order() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def _ignore_more_hangups() -> None:
+    """A terminal that is closed sends SIGHUP, and its shell does, too: the second one must not end
+    what the first one has begun to end in good order.
+    """
+    if signal.SIGHUP in leaving():
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+
 def run(
     work: "Callable[[asyncio.Event], Coroutine[Any, Any, T]]",
     duration_s: float | None = None,
-    ending: Sequence[signal.Signals] = service.ENDING,
+    ending: Sequence[signal.Signals] | None = None,
 ) -> T:
     """Work, and return the result.
 
-    The event is set by the signals `ending`, a second one of which ends at once, and after
-    `duration_s`.
+    The event is set by the signals `ending`, by default those of `leaving`, of which a second one
+    ends at once, but for SIGHUP; and after `duration_s`.
     """
 
     import asyncio
+
+    taken = leaving() if ending is None else ending
 
     async def working() -> T:
         stop, loop = asyncio.Event(), asyncio.get_running_loop()
 
         def end() -> None:
             stop.set()
-            for number in ending:
+            for number in taken:
                 loop.remove_signal_handler(number)
+            if signal.SIGHUP in taken:
+                _ignore_more_hangups()
 
-        for number in ending:
+        for number in taken:
             loop.add_signal_handler(number, end)
         if duration_s is not None:
             loop.call_later(duration_s, stop.set)

@@ -10,7 +10,6 @@ from skin_host.cli.common import (
     Progress,
     add_command,
     add_config,
-    ended_in_good_order,
     load_skin,
     print_json,
     refuse_input,
@@ -19,6 +18,7 @@ from skin_host.cli.common import (
 from skin_host.cli.options import add_rules
 from skin_host.cli.recordings import PROCESSED, add_calibration, add_onto, play
 from skin_host.errors import RequestError, SkinError, visible
+from skin_host.files import check_output
 
 
 def add_commands(commands: Commands) -> None:
@@ -146,11 +146,12 @@ def _replay(arguments: argparse.Namespace) -> int:
 
     output = None if arguments.output == "-" else Path(arguments.output)
     refuse_input(output, log, arguments.config, arguments.calibration)
+    if output is not None:
+        check_output(output)
     calibrated = arguments.calibration, arguments.calibrate_seconds
     task = Task(log, arguments.config, output, *calibrated)
     try:
-        with ended_in_good_order():
-            process(task, told, lambda doubt: warn(f"{log}: {doubt}"))
+        process(task, told, lambda doubt: warn(f"{log}: {doubt}"))
     finally:
         progress.close()
     return 0
@@ -187,17 +188,16 @@ def _replay_all(arguments: argparse.Namespace) -> int:
         raise RequestError(f"--output {folder}: {error.strerror}") from None
     progress = Progress("replay")
     worst = 0
-    with ended_in_good_order():
-        for number, (task, result) in enumerate(process_all(tasks, arguments.scheduler), 1):
-            if isinstance(result, SkinError):
-                progress.close()
-                print(f"skin replay: {visible(str(result))}", file=sys.stderr)
-                worst = max(worst, result.exit_status)
-            elif result:
-                progress.close()
-                for doubt in result:
-                    warn(f"{task.log}: {doubt}")
-            progress.update(number / len(tasks), task.log.name)
+    for number, (task, result) in enumerate(process_all(tasks, arguments.scheduler), 1):
+        if isinstance(result, SkinError):
+            progress.close()
+            print(f"skin replay: {visible(str(result))}", file=sys.stderr)
+            worst = max(worst, result.exit_status)
+        elif result:
+            progress.close()
+            for doubt in result:
+                warn(f"{task.log}: {doubt}")
+        progress.update(number / len(tasks), task.log.name)
     progress.close()
     return worst
 

@@ -193,10 +193,11 @@ def _run_node(arguments: argparse.Namespace) -> int:
     import asyncio
 
     from skin_host.config.settings import Settings
+    from skin_host.daemon.alone import alone
     from skin_host.daemon.daemon import Daemon
     from skin_host.daemon.memory import remembered
     from skin_host.daemon.workers import share_name, share_of
-    from skin_host.layout import build_layout
+    from skin_host.layout import build_layout, parts_of
     from skin_host.processes import end_with_parent
 
     set_up_logging(arguments.verbose)
@@ -216,9 +217,7 @@ def _run_node(arguments: argparse.Namespace) -> int:
         node = share_name(arguments.node, arguments.share[0])
         settings = ours(settings)
         layout = build_layout(settings, arguments.config.parent)
-    # Of a new calibration, gains come from the file later.
-    memory = remembered(settings, layout, node, arguments.node, take_new=arguments.calibrate)
-    warn_of_virtual(settings)
+    parts_of(layout, node)
 
     async def work(stop: asyncio.Event) -> None:
         daemon = Daemon(
@@ -238,7 +237,11 @@ def _run_node(arguments: argparse.Namespace) -> int:
         gc.freeze()
         await daemon.run(stop, calibrate=arguments.calibrate)
 
-    run(work, arguments.duration)
+    with alone(settings, node):
+        # Of a new calibration, gains come from the file later.
+        memory = remembered(settings, layout, node, arguments.node, take_new=arguments.calibrate)
+        warn_of_virtual(settings)
+        run(work, arguments.duration, service.ENDING)  # SIGHUP reloads
     return 0
 
 
@@ -257,6 +260,7 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings", layout: "L
     import asyncio
 
     from skin_host.daemon import workers
+    from skin_host.daemon.alone import alone
     from skin_host.daemon.memory import hand_over
     from skin_host.daemon.workers import share_name, share_of, share_out
 
@@ -268,8 +272,6 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings", layout: "L
         log.info("workers: %d; the buses cannot be shared among more", len(shares))
     numbers = {share_name(node, number): number for number in range(1, len(shares) + 1)}
     of_shares = {name: share_of(settings, node, one, len(shares)) for name, one in numbers.items()}
-    hand_over(settings, layout, node, of_shares)
-    _show_running(settings)
     options = ["--calibrate"] * arguments.calibrate + ["--verbose"] * arguments.verbose
     if arguments.duration is not None:
         options += ["--duration", str(arguments.duration)]
@@ -280,7 +282,10 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings", layout: "L
         ]
         for name, number in numbers.items()
     }
-    return asyncio.run(workers.run(commands))
+    with alone(settings, node):
+        hand_over(settings, layout, node, of_shares)
+        _show_running(settings)
+        return asyncio.run(workers.run(commands))
 
 
 def _scan(arguments: argparse.Namespace) -> int:

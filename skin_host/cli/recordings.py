@@ -12,9 +12,8 @@ from skin_host.cli.common import (
     Commands,
     add_command,
     add_config,
-    ended_in_good_order,
+    filled,
     finite,
-    leaving,
     load_skin,
     positive,
     print_json,
@@ -24,6 +23,7 @@ from skin_host.cli.common import (
 )
 from skin_host.cli.options import add_rules
 from skin_host.errors import RequestError, SkinError
+from skin_host.files import check_output
 
 if TYPE_CHECKING:
     import asyncio
@@ -51,7 +51,7 @@ def add_commands(commands: Commands) -> None:
         "file", metavar="FILE", type=Path, help="new file: .mcap, or for CAN alone .log, .blf, .asc"
     )
     record.add_argument("--broker", metavar="URL", help=f"record its messages ({LOCAL})")
-    record.add_argument("--robot", help="whose, if the broker knows several")
+    record.add_argument("--robot", type=filled, help="whose, if the broker knows several")
     record.add_argument("--config", type=Path, help="record the CAN frames of its buses")
     record.add_argument("--seconds", type=positive, metavar="S", help="end after so long")
     record.add_argument("--json", action="store_true", help="one JSON document at the end")
@@ -140,7 +140,9 @@ def add_onto(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--broker", default=LOCAL, metavar="URL", help="for --onto broker")
     parser.add_argument(
-        "--robot", help="for --onto broker: play it under this name, not the recorded or configured"
+        "--robot",
+        type=filled,
+        help="for --onto broker: play it under this name, not the recorded or configured",
     )
 
 
@@ -189,11 +191,14 @@ def _calibration(
     """Return the calibration with which a recording is processed; print what is in doubt of it."""
     from skin_host.recording.replay import calibration_for, doubts
 
+    def warn_of(doubt: str) -> None:
+        warn(f"{log}: {doubt}")
+
     found = calibration_for(
-        log, settings, layout, arguments.calibration, arguments.calibrate_seconds
+        log, settings, layout, arguments.calibration, arguments.calibrate_seconds, warn_of
     )
     for doubt in doubts(found, settings, layout):
-        warn(f"{log}: {doubt}")
+        warn_of(doubt)
     return found
 
 
@@ -214,14 +219,14 @@ def _record(arguments: argparse.Namespace) -> int:
         raise RequestError(f"{file}: is there already; remove it or choose another name")
     if is_mcap(file):
         with Recorder(file) as recorder:
-            told = run(partial(_capture, arguments, recorder, None), arguments.seconds, leaving())
+            told = run(partial(_capture, arguments, recorder, None), arguments.seconds)
         told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
     else:
         if arguments.config is None or arguments.broker is not None:
             raise RequestError(f"{file}: holds CAN frames alone and needs --config; or use .mcap")
         settings, _ = load_skin(arguments.config)
         with CanLog(file, [bus.channel for bus in settings.buses.values()]) as log:
-            told = run(partial(_capture, arguments, None, log), arguments.seconds, leaving())
+            told = run(partial(_capture, arguments, None, log), arguments.seconds)
         told |= {"frames": log.frames}
         told |= {"frames_left_out": log.left_out} if log.left_out else {}
         told |= {"times_moved": log.moved} if log.moved else {}
@@ -300,13 +305,15 @@ def _series(arguments: argparse.Namespace) -> "Series":
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from skin_host.recording.export import export
+    from skin_host.recording.export import check_format, export
 
     refuse_input(arguments.output, arguments.recording, arguments.config, arguments.calibration)
-    with ended_in_good_order():
-        written = export(
-            _series(arguments), arguments.output, arguments.recording, lerobot=arguments.lerobot
-        )
+    # Before the work, which takes minutes for a long recording.
+    check_format(arguments.output, lerobot=arguments.lerobot)
+    check_output(arguments.output, folder=not arguments.output.suffix)
+    written = export(
+        _series(arguments), arguments.output, arguments.recording, lerobot=arguments.lerobot
+    )
     for path in written:
         print(path)
     return 0
@@ -318,6 +325,8 @@ def _plot(arguments: argparse.Namespace) -> int:
     from skin_host.recording import plots
 
     refuse_input(arguments.output, arguments.recording, arguments.config, arguments.calibration)
+    plots.check_format(arguments.output)
+    check_output(arguments.output)
     if arguments.what == "calibration":
         if arguments.config is None:
             raise RequestError("a calibration is drawn with --config, whose skin it is of")

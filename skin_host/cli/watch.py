@@ -14,6 +14,7 @@ from skin_host.cli.common import (
     add_command,
     add_log_level,
     count,
+    filled,
     port_number,
     print_json,
     run,
@@ -46,7 +47,7 @@ def add_commands(commands: Commands) -> None:
         "skin listen --part left_hand --broker mqtt://robot.local",
     )
     add_broker(listen)
-    listen.add_argument("--part", help="only this part")
+    listen.add_argument("--part", type=filled, help="only this part")
     listen.add_argument("--moves", action="store_true", help="also while a touch goes on")
     listen.add_argument("--json", action="store_true", help="one JSON document a line")
     listen.add_argument("--count", type=count, metavar="N", help="end after N lines")
@@ -76,12 +77,14 @@ def add_commands(commands: Commands) -> None:
     viewers.add_argument(
         "--rerun", action="store_true", help="serve Rerun's viewer instead (extra `rerun`)"
     )
-    view.add_argument("--host", default="127.0.0.1", help="address to listen on")
+    # An empty one, as of a variable of the shell that is not set, would be every address.
+    view.add_argument("--host", type=filled, default="127.0.0.1", help="address to listen on")
     view.add_argument(
         "--port", type=port_number, help="port to listen on (8080; Foxglove 8765, Rerun 9090)"
     )
     view.add_argument(
         "--name",
+        type=filled,
         action="append",
         default=[],
         help="the page: another name of this machine, such as that of a proxy",

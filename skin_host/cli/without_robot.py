@@ -31,7 +31,8 @@ from skin_host.cli.common import (
 )
 from skin_host.cli.options import add_rules
 from skin_host.daemon import service
-from skin_host.errors import ConfigurationError, RequestError, required, visible
+from skin_host.errors import ConfigurationError, RequestError, visible
+from skin_host.files import check_output
 
 if TYPE_CHECKING:
     import can
@@ -244,6 +245,8 @@ def _emulate(arguments: argparse.Namespace) -> int:
         }
         settings = changed(settings, {f"buses.{name}": changed(bus, chosen)})
     warn_of_virtual(settings)
+    if arguments.state is not None:
+        check_output(arguments.state)
     wanted = settings.buses
     if arguments.i2c:
         only = settings.boards[arguments.board].bus
@@ -431,6 +434,7 @@ def _bench(arguments: argparse.Namespace) -> int:
 
 def _report(arguments: argparse.Namespace) -> int:
     from skin_host.evaluation.steps import show_step
+    from skin_host.recording.plots import find_matplotlib
 
     kinds = {"papers.contacts_report": arguments.contacts, "rig_report": arguments.rig}
     kinds |= {"real": arguments.real, "report": True}
@@ -439,8 +443,9 @@ def _report(arguments: argparse.Namespace) -> int:
     output = arguments.output
     if output is None and not arguments.json and not arguments.real:
         output = Path("report")
-    if output is not None:
-        required("matplotlib", "pictures", "plots")  # before the work, which takes minutes
+    if output is not None:  # before the work, which takes minutes
+        find_matplotlib()
+        check_output(output, folder=True)
     on_recordings = {"recordings": arguments.recordings} if name in ("real", "report") else {}
     try:
         document = module.run(quick=arguments.quick, output=output, **on_recordings)

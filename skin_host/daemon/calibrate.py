@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import logging
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -251,3 +252,28 @@ def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibra
         log.warning("%s", error)
         set_aside(path)
         return None
+
+
+def keep_former(path: Path, layout: Layout, configuration: str) -> None:
+    """Give a calibration of another configuration a second name, before a new one takes its own:
+    gains and curves that were fitted are in no other file.
+    """
+    try:
+        load_calibration(path, layout, configuration)
+    except OtherSkinError:
+        former = path.with_name(f"{path.name}.former-{SYSTEM.today():%Y%m%dT%H%M%SZ}")
+    except SkinError:
+        return
+    else:
+        return
+    try:
+        os.link(path, former)
+    except OSError as error:
+        log.warning("%s: of another configuration, and not kept: %s", path, error.strerror)
+        return
+    log.warning(
+        "%s: of another configuration; kept as %s. Gains and curves that were fitted to its pads "
+        "are not used any more: fit them again with skin calibrate CONFIG --pressure LOG",
+        path,
+        former.name,
+    )

@@ -17,7 +17,7 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings, load, needs_restart, skin_hash
 from skin_host.daemon import metrics, service
-from skin_host.daemon.calibrate import collect
+from skin_host.daemon.calibrate import collect, keep_former
 from skin_host.daemon.control import Control
 from skin_host.daemon.lasting import LastingTouches
 from skin_host.daemon.link import Link, OpenPort
@@ -289,6 +289,10 @@ class Daemon:
                 keeping = self._keep_zeros(before=known, doubted=doubted)
                 self._keeping = asyncio.create_task(keeping, name="keep zeros")
                 await self._kept()
+            if before is None:
+                await self.clock.in_thread(
+                    keep_former, path, self.layout, self.engine.configuration
+                )
             await self._save_calibration()
             self._put_info(await self.clock.in_thread(self._info))
             return found

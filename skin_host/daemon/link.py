@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.boards import Boards
+from skin_host.bus.commands import ZEROING, Message, cut_where_zeroed, parse_command
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import Port
 from skin_host.bus.wake import LONGEST_NS, WakeUp
@@ -44,6 +45,11 @@ CLOCK_SET_NS = 100_000_000
 #: In so many turns all is read that waits when a board is zeroed, but where this computer is too
 #: slow for what comes.
 MOST_TURNS = 64
+#: What some buses return of what was sent on them, as multicast does, comes within this time.
+ECHO_S = 1.0
+#: Commands of another program that follow each other as fast give a board one zero: a new one is
+#: found over a longer time, and anybody on the bus may send as many as it carries.
+ONE_ZERO_NS = 20_000_000
 #: A bus that does not take the set-up of its boards is tried again after this.
 RETRY_S = 2.0
 STOP_S = 1.0
@@ -130,6 +136,10 @@ class Link:
         self._longest_pause_ns = 0
         #: Identifier, data and time of each frame that was sent since the last turn, by bus.
         self._sent: dict[str, list[tuple[int, bytes, int]]] = {}
+        #: Bus, receiver and command of what was sent, and when, s: some buses return it.
+        self._echoes: list[tuple[tuple[str, int, Message], float]] = []
+        #: When another program last gave each board a zero.
+        self._zeroed_ns: dict[int, int] = {}
         #: Reads the buses and passes the results on, once `read` does that.
         self._work: Callable[[], None] = lambda: None
         try:
@@ -151,6 +161,10 @@ class Link:
                     self._zeroed,
                     clock,
                     engine.assemblers[bus].unconfigured,
+                    {
+                        *(tip.address for tip in settings.fingertips.values() if tip.bus == bus),
+                        *(one.settings.address for one in layout.boards if one.settings.bus == bus),
+                    },
                 )
                 if fingertips is not None and (tips := fingertips.on_bus(bus)):
                     self.force_torque[bus] = StrainBoards(
@@ -235,11 +249,12 @@ class Link:
         for bus, batch in recorded:
             record(bus, batch)
         for bus, batch in slices:
-            output = self._engine.feed(bus, batch)
-            if output.answers:
-                self._note_answers(bus, output.answers)
-            self._note(output)
-            deliver(output)
+            for piece in cut_where_zeroed(batch, partial(self._note_other_host, bus)):
+                output = self._engine.feed(bus, piece)
+                if output.answers:
+                    self._note_answers(bus, output.answers)
+                self._note(output)
+                deliver(output)
         self.read_ns = read_ns
         # What is behind is complete up to its last frame, whatever held this computer up.
         if self._held_up_at_ns is not None and not is_behind and self._is_patient(now_ns):
@@ -256,6 +271,24 @@ class Link:
 
     def _note_sent(self, bus: str, identifier: int, data: bytes) -> None:
         self._sent.setdefault(bus, []).append((identifier, data, self._clock.now_ns()))
+        parsed = parse_command(identifier, data)
+        if parsed is not None and isinstance(parsed[1], ZEROING):
+            now_s = self._clock.monotonic_s()
+            self._echoes = [one for one in self._echoes if now_s - one[1] < ECHO_S]
+            self._echoes.append(((bus, *parsed), now_s))
+
+    def _note_other_host(self, bus: str, address: int, command: Message, t_ns: int) -> None:
+        """A command was received that gives a board, or all, another zero."""
+        now_s = self._clock.monotonic_s()
+        for echo in self._echoes:
+            if echo[0] == (bus, address, command) and now_s - echo[1] < ECHO_S:
+                self._echoes.remove(echo)
+                return
+        for board, believed in self.boards[bus].note_other_host(address, command):
+            since_ns = t_ns - self._zeroed_ns.get(board, -ONE_ZERO_NS)
+            if not 0 <= since_ns < ONE_ZERO_NS:
+                self._zeroed_ns[board] = t_ns
+                self._engine.zeros.rezero(board, believed)
 
     def _with_sent(self, batches: list[tuple[str, FrameBatch]]) -> list[tuple[str, FrameBatch]]:
         """Return the batches of a turn together with what was sent since the turn before."""
@@ -338,8 +371,6 @@ class Link:
 
     def _note_answers(self, bus: str, answers: list[tuple[int, bytes]]) -> None:
         self.boards[bus].note_answers(answers)
-        if bus in self.force_torque:
-            self.force_torque[bus].claim(self.boards[bus].strangers)
 
     async def bring_up(self) -> None:
         """Set up and start the boards of every bus; a bus where that fails is tried again for

@@ -1,9 +1,9 @@
 """What a node remembers of its skin, whichever node had that skin before.
 
 `skin run --workers N` makes N nodes of one; another N others, and without it they are one again.
-Each keeps files of its own, so that what is known of a part lies in the files of the node that had
-it last. Calibration, zeros and what operators changed belong together: without the zeros a pressed
-taxel would look untouched.
+The configuration may give a part to another node, too. Each keeps files of its own, so that what is
+known of a part lies in the files of the node that had it last. Calibration, zeros and what
+operators changed belong together: without the zeros a pressed taxel would look untouched.
 """
 
 import logging
@@ -13,10 +13,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from skin_host.config.settings import Settings
+from skin_host.config.settings import Settings, skin_hash
 from skin_host.daemon import service
 from skin_host.daemon.calibrate import stored_calibration
 from skin_host.daemon.state import (
@@ -28,12 +29,12 @@ from skin_host.daemon.state import (
     load_kept,
     taxels_of,
 )
-from skin_host.errors import OtherRobotError, OtherSkinError
-from skin_host.files import write_document
+from skin_host.errors import OtherRobotError, OtherSkinError, SkinError
+from skin_host.files import read_document, refuse_other_robot, write_document
 from skin_host.layout import Layout, PadKind, PartLayout, parts_of
 from skin_host.processing.calibration import Calibration, Verdict, Zero, identified, with_curves
 from skin_host.processing.calibration.calibrator import Known
-from skin_host.processing.calibration.file import save_calibration
+from skin_host.processing.calibration.file import load_calibration, save_calibration
 
 log = logging.getLogger(__name__)
 
@@ -86,6 +87,18 @@ class _Files:
             names = [*self.zeros.baselines]
         return name in names if names else by_default
 
+    def names(self, name: str) -> bool:
+        """Return whether the zeros show that the node had a part or fingertip."""
+        known = self.zeros is not None and bool(self.zeros.calibration)
+        return known and self.had(name, by_default=False)
+
+    def lacked(self, name: str) -> bool:
+        """Return whether the zeros show that the node did not have a part or fingertip when its
+        calibration was taken, which may hold an older one of it.
+        """
+        names = None if self.zeros is None else self.zeros.parts
+        return bool(names) and name not in (names or ()) and self.taken_s() <= self.last_s[0]
+
     def taken_s(self) -> float:
         """Return when the calibration was taken, s since 1970."""
         return _seconds(self.calibration.time if self.calibration else "") or 0.0
@@ -118,8 +131,8 @@ def remembered(
     """
     whole = whole or node
     parts_of(layout, node)
-    found, refused = _found(settings, layout, [node], _others(settings, [node], whole))
-    memory = _Memories(settings, layout, node, whole, found).joined()
+    found, former, refused = _found(settings, layout, [node], whole)
+    memory = _Memories(settings, layout, node, whole, found, former).joined()
     if memory.calibration is None and refused is not None and not take_new:
         raise refused
     if memory.from_others:
@@ -141,12 +154,13 @@ def hand_over(
     Raises:
         OtherRobotError, NewerFileError, BusyFileError: see `remembered`.
     """
-    found, _ = _found(settings, layout, [*shares], _others(settings, [*shares], whole))
+    found, former, _ = _found(settings, layout, [*shares], whole)
     by_node = {one.node: one for one in found}
     memories = {}
     for name, share in shares.items():
         others = [one for one in found if one.node != name]
-        memories[name] = _Memories(share, layout, name, whole, [by_node[name], *others]).joined()
+        mine = [by_node[name], *others]
+        memories[name] = _Memories(share, layout, name, whole, mine, former).joined()
     for name, memory in memories.items():
         if memory.from_others:
             _keep(settings, layout, name, memory)
@@ -161,7 +175,7 @@ def remembered_with(
         ConfigurationError, OtherRobotError, NewerFileError, BusyFileError: see `remembered`.
     """
     found = [_files(settings, node, calibration)]
-    return _Memories(settings, layout, node, node, found).joined()
+    return _Memories(settings, layout, node, node, found, []).joined()
 
 
 def known_of(calibration: Calibration, zeros: Zeros, layout: Layout) -> Known:
@@ -179,14 +193,16 @@ def known_of(calibration: Calibration, zeros: Zeros, layout: Layout) -> Known:
 
 
 def _found(
-    settings: Settings, layout: Layout, nodes: list[str], others: list[str]
-) -> tuple[list[_Files], OtherSkinError | None]:
-    """Read the files of nodes that start, and of others, which may be those of another robot and
-    are passed over then; return also why a calibration was refused.
+    settings: Settings, layout: Layout, nodes: list[str], whole: str
+) -> tuple[list[_Files], list[_Files], OtherSkinError | None]:
+    """Read the files of nodes that start, and of the whole one and its shares, which may be those
+    of another robot and are passed over then; and of all other nodes. Return also why a calibration
+    was refused.
     """
+    family, foreign = _others(settings, nodes, whole)
     found: list[_Files] = []
     refused: OtherSkinError | None = None
-    for name in (*nodes, *others):
+    for name in (*nodes, *family):
         calibration = None
         try:
             try:
@@ -197,7 +213,32 @@ def _found(
         except OtherRobotError:
             if name in nodes:
                 raise
-    return found, refused
+    former = [_files_of_former(settings, layout, name) for name in foreign]
+    return found, [one for one in former if one is not None], refused
+
+
+def _files_of_former(settings: Settings, layout: Layout, node: str) -> _Files | None:
+    """Read the files of a node that may have had a part before; None if one of them cannot be used,
+    as it is damaged or another robot's: that node reports it.
+    """
+    kept: dict[str, Any] = {}
+    calibration = None
+    try:
+        for what, kind in (("state", NodeState), ("zeros", Zeros), ("calibration", None)):
+            path = kept_path(settings, node, what)
+            kept[what] = None
+            if not is_there(path):
+                continue
+            refuse_other_robot(path, settings.robot, what)
+            if kind is not None:
+                kept[what] = read_document(path, kind, kind().schema, what, ValueError)
+                continue
+            with suppress(OtherSkinError):
+                calibration = load_calibration(path, layout, skin_hash(settings))
+    except (SkinError, ValueError):
+        return None
+    last_s = _last_s(kept_path(settings, node, "zeros"), kept["zeros"] or Zeros())
+    return _Files(node, calibration, kept["state"], kept["zeros"], last_s)
 
 
 def _keep(settings: Settings, layout: Layout, node: str, memory: NodeMemory) -> dict[str, str]:
@@ -223,21 +264,25 @@ def _keep(settings: Settings, layout: Layout, node: str, memory: NodeMemory) -> 
     return unkept
 
 
-def _others(settings: Settings, nodes: list[str], whole: str) -> list[str]:
-    """Return the nodes besides these that have files here: the whole one, and its shares."""
+def _others(settings: Settings, nodes: list[str], whole: str) -> tuple[list[str], list[str]]:
+    """Return the nodes besides these that have files here: the whole one, and its shares; and the
+    others, of which some may be another robot's.
+    """
     named = re.compile(
-        rf"{re.escape(f'{settings.robot}-')}({re.escape(whole)}(?:-[1-9][0-9]*)?)"
-        r"\.(?:calibration|state|zeros)\.json"
+        rf"{re.escape(f'{settings.robot}-')}([a-z0-9_-]+)\.(?:calibration|state|zeros)\.json"
     )
+    of_whole = re.compile(rf"{re.escape(whole)}(?:-[1-9][0-9]*)?")
     try:
         names = sorted(
             path.name
             for path in service.state_directory(settings.service.state_directory).iterdir()
         )
     except OSError:
-        return []
-    others = dict.fromkeys(match[1] for match in map(named.fullmatch, names) if match is not None)
-    return [one for one in others if one not in nodes]
+        return [], []
+    found = dict.fromkeys(match[1] for match in map(named.fullmatch, names) if match is not None)
+    others = [one for one in found if one not in nodes]
+    family = [one for one in others if of_whole.fullmatch(one)]
+    return family, [one for one in others if one not in family]
 
 
 def _files(settings: Settings, node: str, calibration: Calibration | None) -> _Files:
@@ -245,17 +290,22 @@ def _files(settings: Settings, node: str, calibration: Calibration | None) -> _F
     there = {what: is_there(one) for what, one in path.items()}
     state = load_kept(path["state"], NodeState, settings.robot)
     zeros = load_kept(path["zeros"], Zeros, settings.robot)
-    changed_s = 0.0
-    with suppress(OSError):
-        changed_s = path["zeros"].lstat().st_mtime
-    written_s = _seconds(zeros.written)
     return _Files(
         node,
         calibration,
         state if there["state"] else None,
         zeros if there["zeros"] else None,
-        (changed_s if written_s is None else written_s, changed_s),
+        _last_s(path["zeros"], zeros),
     )
+
+
+def _last_s(path: Path, zeros: Zeros) -> tuple[float, float]:
+    """Return when zeros were written, and when their file was, s since 1970."""
+    changed_s = 0.0
+    with suppress(OSError):
+        changed_s = path.lstat().st_mtime
+    written_s = _seconds(zeros.written)
+    return (changed_s if written_s is None else written_s, changed_s)
 
 
 def _seconds(time: str) -> float | None:
@@ -268,10 +318,18 @@ def _seconds(time: str) -> float | None:
 
 
 class _Memories:
-    """The files of a node, first, and of those that may have had its parts before."""
+    """The files of a node, first, of those that it is a share of or shared with, and of other
+    nodes, which may have had its parts before.
+    """
 
     def __init__(
-        self, settings: Settings, layout: Layout, node: str, whole: str, found: list[_Files]
+        self,
+        settings: Settings,
+        layout: Layout,
+        node: str,
+        whole: str,
+        found: list[_Files],
+        former: list[_Files],
     ) -> None:
         self._layout = layout
         self._parts = [part for part in layout.parts if settings.parts[part.name].node == node]
@@ -279,13 +337,17 @@ class _Memories:
         self._own = found[0]
         self._whole = whole
         self._found = found
+        self._former = former
+        #: By part and fingertip: whether a calibration has measured it.
+        self._measured = {
+            **{part.name: _measured(part) for part in self._parts},
+            **{tip: _zeroed(tip) for tip in self._tips},
+        }
 
     def joined(self) -> NodeMemory:
         """Join what is known of the node's parts and fingertips."""
-        chosen = {
-            part.name: self._calibration(part.name, self._measured(part)) for part in self._parts
-        }
-        tips = {tip: self._calibration(tip, _zeroed(tip)) for tip in self._tips}
+        chosen = {part.name: self._calibration(part.name) for part in self._parts}
+        tips = {tip: self._calibration(tip) for tip in self._tips}
         calibration = self._joined_calibration(chosen, tips)
         state, from_others = self._state()
         zeros = Zeros(
@@ -311,26 +373,40 @@ class _Memories:
     def _that_had(self, name: str) -> list[_Files]:
         return [
             one
-            for one in self._found
+            for one in self._that_may_know(name)
             if one.had(name, by_default=one.node in (self._own.node, self._whole))
         ]
 
-    def _measured(self, part: PartLayout) -> Callable[[Calibration], bool]:
-        mine = slice(part.start, part.stop)
-        return lambda calibration: bool((calibration.verdict[mine] != Verdict.ABSENT).any())
+    def _that_may_know(self, name: str) -> list[_Files]:
+        """Return the files that may hold what is known of a part or fingertip: of another node
+        those which show that it had this, or any if nothing else is known of it.
+        """
+        found = [*self._found, *(one for one in self._former if one.names(name))]
+        measured = self._measured[name]
+        is_known = any(
+            one.names(name) or (one.calibration is not None and measured(one.calibration))
+            for one in found
+        )
+        return found if is_known else [*self._found, *self._former]
 
-    def _calibration(self, name: str, measured: Callable[[Calibration], bool]) -> _Files | None:
+    def _calibration(self, name: str) -> _Files | None:
         """Return the files with the calibration of a part or fingertip; None if there are none.
 
         It is that of the node which had it last, or one that was taken later.
         """
-        having = self._that_had(name)
+        found, having = self._that_may_know(name), self._that_had(name)
+        measured = self._measured[name]
         # A node that has taken something over has copies of the parts of others, and zeros.
         entitled = [
             one
-            for one in self._found
+            for one in found
             if one.calibration is not None
-            and (one in having or one.node == self._whole or one.zeros is None or not having)
+            and (
+                one in having
+                or (one.node == self._whole and not one.lacked(name))
+                or one.zeros is None
+                or not having
+            )
             and measured(one.calibration)
         ]
         newest = max(entitled, key=_Files.taken_s, default=None)
@@ -343,7 +419,7 @@ class _Memories:
             return newest
         if holder.calibration is not None:
             return holder
-        for one in self._found:
+        for one in found:
             if one.calibration and holder.zeros and holder.zeros.are_of(one.calibration.id):
                 return one
         return None if holder is self._own else newest
@@ -396,7 +472,7 @@ class _Memories:
         touched: list[int] = []
         if kept is None:
             # Who has kept no zeros yet has lost none; what is another's should have come with some.
-            shown = [self._own] if chosen is self._own else self._found
+            shown = [self._own] if chosen is self._own else self._that_may_know(part.name)
             last_s = [one.last_s[0] for one in shown if one.zeros is not None]
             if chosen is not None and last_s and chosen.taken_s() <= max(last_s):
                 unknown = all_taxels
@@ -444,6 +520,11 @@ class _Memories:
         if thresholds is not None:
             state.thresholds = thresholds
         return state, any(one is not self._own for one in sources)
+
+
+def _measured(part: PartLayout) -> Callable[[Calibration], bool]:
+    mine = slice(part.start, part.stop)
+    return lambda calibration: bool((calibration.verdict[mine] != Verdict.ABSENT).any())
 
 
 def _zeroed(tip: str) -> Callable[[Calibration], bool]:

@@ -28,6 +28,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection as Pipe
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -48,6 +49,7 @@ from skin_host.mqtt.connection import Connection, Message
 from skin_host.mqtt.messages import decode_contact, decode_touch
 from skin_host.mqtt.order import run_of, stamp_of
 from skin_host.mqtt.publisher import Publisher
+from skin_host.processes import beside
 from skin_host.processing.events import Touch
 from skin_host.tasks import cancel
 
@@ -141,7 +143,8 @@ def measure(brokers: Brokers, plan: FleetPlan) -> dict[str, Any]:
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, max(soft, 65536)), hard))
     context = multiprocessing.get_context("spawn")
     pipes: list[Pipe] = []
-    workers = []
+    ends: list[Pipe] = []
+    workers: list[BaseProcess] = []
     everyone = [f"robot{i}" for i in range(plan.robots)]
     shares = [(everyone[number::WORKERS], False) for number in range(WORKERS)]
     if plan.plain:
@@ -153,23 +156,16 @@ def measure(brokers: Brokers, plan: FleetPlan) -> dict[str, Any]:
         worker = context.Process(
             target=_work, args=(theirs, names, keys, brokers.password, plan, plain), daemon=True
         )
-        worker.start()
         pipes.append(mine)
+        ends.append(theirs)
         workers.append(worker)
 
     async def conduct() -> dict[str, Any]:
-        try:
+        # They end before the loop does, which waits for threads that wait for an answer of these.
+        with beside(workers, *ends):
             return await _conduct(brokers, plan, pipes)
-        finally:
-            # Before the loop ends, which waits for threads that wait for an answer of these.
-            for worker in workers:
-                worker.kill()
 
-    try:
-        return asyncio.run(conduct())
-    finally:
-        for worker in workers:
-            worker.join()
+    return asyncio.run(conduct())
 
 
 async def _conduct(brokers: Brokers, plan: FleetPlan, pipes: list[Pipe]) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from skin_host.evaluation.can_stream import FULL_BUS_FRAMES_PER_S, FrameStream, 
 from skin_host.evaluation.touch_listener import PLAIN_TOPIC, collected, listen, publish_plain
 from skin_host.layout import build_layout
 from skin_host.mqtt.broker import find_mosquitto, mosquitto_broker
+from skin_host.processes import beside
 
 #: The daemon must have set itself up and calibrated by then; the test machine's processor is slow.
 _READY_S = 150.0
@@ -93,18 +94,19 @@ async def _measure(program: str, stream: FrameStream, seconds: float) -> Documen
     async with mosquitto_broker(program) as broker:
         sender_end, sender_child_end = context.Pipe()
         listener_end, listener_child_end = context.Pipe()
+        states = tempfile.TemporaryDirectory(prefix="skin-bench-")
         processes = [
             context.Process(target=listen, args=(listener_child_end, broker.port), daemon=True),
-            context.Process(target=_daemon, args=(wire, stream, broker.port), daemon=True),
+            context.Process(
+                target=_daemon, args=(wire, stream, broker.port, states.name), daemon=True
+            ),
             context.Process(
                 target=send,
                 args=(sender_child_end, wire, stream, _READY_S + 2 * seconds, _scenes(stream)),
                 daemon=True,
             ),
         ]
-        try:
-            for process in processes:
-                process.start()
+        with states, beside(processes, listener_child_end, sender_child_end):
             if not await asyncio.to_thread(listener_end.poll, _READY_S):
                 raise SkinError(f"the daemon did not calibrate within {_READY_S:g} s")
             listener_end.recv()
@@ -113,10 +115,6 @@ async def _measure(program: str, stream: FrameStream, seconds: float) -> Documen
             touches_ns = await collected(listener_end)
             await publish_plain(broker.port, seconds)
             plain_ns = (await collected(listener_end))[PLAIN_TOPIC]
-        finally:
-            for process in processes:
-                process.terminate()
-                process.join()
     delays_ns = [delay_ns for delays_ns in touches_ns.values() for delay_ns in delays_ns]
     if not delays_ns:
         raise SkinError("no touch was published")
@@ -151,20 +149,19 @@ def _scenes(stream: FrameStream) -> list[NDArray[np.uint8]]:
     return [quiet.astype(np.uint8), pressed.astype(np.uint8)]
 
 
-def _daemon(wire: StreamWire, stream: FrameStream, broker_port: int) -> None:
-    """Process: `skin run`."""
+def _daemon(wire: StreamWire, stream: FrameStream, broker_port: int, state: str) -> None:
+    """Process: `skin run`, which keeps its state in a folder of its parent's."""
     logging.disable(logging.WARNING)  # no board of this stream answers commands
     settings = stream.settings(wire.bus())
-    with tempfile.TemporaryDirectory(prefix="skin-bench-") as state:
-        settings = changed(
-            settings,
-            {
-                "mqtt.host": "127.0.0.1",
-                "mqtt.port": broker_port,
-                "processing.calibration.seconds": _CALIBRATION_S,
-                "service.state_directory": state,
-            },
-        )
-        daemon = Daemon(settings, build_layout(settings, Path()))
-        gc.freeze()  # as `skin run` does
-        asyncio.run(daemon.run(asyncio.Event(), calibrate=True))
+    settings = changed(
+        settings,
+        {
+            "mqtt.host": "127.0.0.1",
+            "mqtt.port": broker_port,
+            "processing.calibration.seconds": _CALIBRATION_S,
+            "service.state_directory": state,
+        },
+    )
+    daemon = Daemon(settings, build_layout(settings, Path()))
+    gc.freeze()  # as `skin run` does
+    asyncio.run(daemon.run(asyncio.Event(), calibrate=True))

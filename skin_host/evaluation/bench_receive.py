@@ -40,6 +40,7 @@ from skin_host.bus.wire import (
 from skin_host.config.settings import Settings
 from skin_host.evaluation.can_stream import BUS, FrameStream, StreamWire, send
 from skin_host.layout import build_layout
+from skin_host.processes import beside
 from skin_host.processing.core import Engine
 
 PATHS = ("notifier_async", "notifier_callback", "batch")
@@ -115,23 +116,21 @@ def measure(wire: StreamWire, path: str, frames_per_s: int, seconds: float) -> R
     sender_end, sender_child_end = context.Pipe()
     warm_up_s = _WARM_UP_S[path]
     reader = context.Process(target=_read, args=(reader_child_end, wire, path, stream), daemon=True)
-    reader.start()
-    reader_end.recv()
     sender = context.Process(
         target=send,
         args=(sender_child_end, wire, stream, warm_up_s + seconds + 0.5, [quiet]),
         daemon=True,
     )
-    sender.start()
-    sender_end.recv()
-    time.sleep(warm_up_s)
-    reader_end.send("begin")
-    time.sleep(seconds)
-    reader_end.send("end")
-    reader_end.send(sender_end.recv())
-    measured: Row = reader_end.recv()
-    sender.join()
-    reader.join()
+    with beside([reader], reader_child_end):
+        reader_end.recv()
+        with beside([sender], sender_child_end):
+            sender_end.recv()
+            time.sleep(warm_up_s)
+            reader_end.send("begin")
+            time.sleep(seconds)
+            reader_end.send("end")
+            reader_end.send(sender_end.recv())
+            measured: Row = reader_end.recv()
     return {"path": path, "frames_per_s": frames_per_s} | measured
 
 

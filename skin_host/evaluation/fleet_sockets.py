@@ -51,7 +51,7 @@ class PlainRobot(asyncio.Protocol):
     def __init__(self, settings: Mqtt, robot: str) -> None:
         self._brokers = Broker.all_from_settings(settings, Path(), f"{robot}/main")
         self._topics = Topics(settings.base, robot)
-        self._identifier = f"skin-{robot}-main"
+        self._identifier = f"{settings.base}/{robot}/main"
         self._status = self._topics.node("status", "main")
         self._numbers = Numbers(time.time_ns, time.monotonic_ns)
         properties: Any = message_properties(self._brokers[0], JSON_TYPE)

@@ -44,6 +44,7 @@ from skin_host.evaluation.stand_in import register
 from skin_host.evaluation.touch_listener import listen
 from skin_host.layout import build_layout
 from skin_host.mqtt.broker import find_mosquitto, mosquitto_broker
+from skin_host.processes import beside
 
 #: Rooms by the beginning of a module's name; the first that fits counts.
 ROOMS = {
@@ -223,7 +224,12 @@ def scenes(body: Body) -> list[NDArray[np.uint8]]:
 
 
 def run_daemon(
-    parent: Connection, body: Body, broker_port: int, number: int = 1, shares: int = 1
+    parent: Connection,
+    body: Body,
+    broker_port: int,
+    state: str,
+    number: int = 1,
+    shares: int = 1,
 ) -> None:
     """Process: `skin run`, measured on the parent's commands.
 
@@ -233,28 +239,28 @@ def run_daemon(
             `count` (answered with CAN frames read and dropped since the start).
         body: whose frames it reads.
         broker_port: of the broker on this machine.
+        state: folder for what it keeps; the parent removes it, because this process is killed.
         number, shares: this is one of several workers, from 1.
     """
     register()
     logging.disable(logging.WARNING)  # no board of this stream answers commands
-    with tempfile.TemporaryDirectory(prefix="skin-bench-") as state:
-        settings = changed(
-            body.settings(),
-            {
-                "mqtt.host": "127.0.0.1",
-                "mqtt.port": broker_port,
-                "processing.calibration.seconds": _CALIBRATION_S,
-                "service.state_directory": state,
-            },
-        )
-        node = "main"
-        if shares > 1:
-            settings, node = share_of(settings, node, number, shares), share_name(node, number)
-        daemon = Daemon(settings, build_layout(settings, Path()), node)
-        gc.freeze()  # as `skin run` does
-        wakeups = Wakeups()
-        with wakeups.runner() as runner:
-            runner.run(_obey(parent, daemon, wakeups))
+    settings = changed(
+        body.settings(),
+        {
+            "mqtt.host": "127.0.0.1",
+            "mqtt.port": broker_port,
+            "processing.calibration.seconds": _CALIBRATION_S,
+            "service.state_directory": state,
+        },
+    )
+    node = "main"
+    if shares > 1:
+        settings, node = share_of(settings, node, number, shares), share_name(node, number)
+    daemon = Daemon(settings, build_layout(settings, Path()), node)
+    gc.freeze()  # as `skin run` does
+    wakeups = Wakeups()
+    with wakeups.runner() as runner:
+        runner.run(_obey(parent, daemon, wakeups))
 
 
 async def _obey(parent: Connection, daemon: Daemon, wakeups: Wakeups) -> None:
@@ -369,27 +375,26 @@ async def running(
         daemon_pipes = [context.Pipe() for _ in range(daemons)]
         sender_pipes = [context.Pipe() for _ in range(senders)]
         made = scenes(body)[:shown]
+        states = tempfile.TemporaryDirectory(prefix="skin-bench-")
         processes = [context.Process(target=listen, args=(listener_child, port, daemons))]
         processes += [
-            context.Process(target=run_daemon, args=(child, body, port, number + 1, daemons))
+            context.Process(
+                target=run_daemon, args=(child, body, port, states.name, number + 1, daemons)
+            )
             for number, (_, child) in enumerate(daemon_pipes)
         ]
         processes += [
             context.Process(target=send_body, args=(child, body, made, number, senders))
             for number, (_, child) in enumerate(sender_pipes)
         ]
-        try:
-            for process in processes:
-                process.daemon = True
-                process.start()
+        for process in processes:
+            process.daemon = True
+        ends = [listener_child, *(child for _, child in daemon_pipes + sender_pipes)]
+        with states, beside(processes, *ends):
             if not await asyncio.to_thread(listener.poll, ready_s):
                 raise SkinError(f"not calibrated within {ready_s:g} s (daemons: {daemons})")
             listener.recv()
-            ends = [one for one, _ in sender_pipes]
-            for sender in ends:
+            mine = [one for one, _ in sender_pipes]
+            for sender in mine:
                 await asyncio.to_thread(sender.recv)
-            yield Running(port, listener, [one for one, _ in daemon_pipes], ends)
-        finally:
-            for process in processes:
-                process.terminate()
-                process.join()
+            yield Running(port, listener, [one for one, _ in daemon_pipes], mine)

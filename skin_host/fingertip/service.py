@@ -62,11 +62,6 @@ class StrainBoards:
                 board.state.awaited = False
             raise
 
-    def claim(self, strangers: dict[int, int]) -> None:
-        """Remove our boards from the boards that answered discovery and are not skin boards."""
-        for board in self._boards:
-            strangers.pop(board.state.settings.address, None)
-
     def supervise(self) -> None:
         """Supervise every board; set-ups run as separate tasks, so this does not wait for them."""
         now_ns = self._clock()

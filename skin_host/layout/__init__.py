@@ -4,7 +4,7 @@ A part's taxels lie side by side in the flat arrays, in the order of its patches
 their triangles, twelve a triangle. All other packages index by this order.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from functools import cache
@@ -45,6 +45,12 @@ SMALLEST_SHARE_MM2 = 0.001
 #: is nearest: the template is then farther off than the centroid (on pads of 5 mm: 0.05 mm with a
 #: probe of 10 mm, 0.7 mm with 15 mm, 2.7 mm with 20 mm; the centroid is 0.1 to 0.2 mm off).
 WIDEST_PITCHES = 3.0
+#: No taxel has so many neighbours: those of the delivered configurations have up to 11. In a part
+#: of any size, so many pairs may be beyond that.
+MOST_NEIGHBOURS = 100
+MOST_PAIRS = 1_000_000
+#: So many pairs are looked at together, which bounds the memory.
+PAIRS_AT_ONCE = 500_000
 
 
 class PadKind(IntEnum):
@@ -184,7 +190,8 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
 
     Raises:
         ConfigurationError: an unknown kind, wrong numbers of places, a bad positions file,
-            taxels that would feel nothing, or probes too large for the pads.
+            taxels that would feel nothing or lie on one another by the thousand, or probes too
+            large for the pads.
     """
     kinds = builtin_kinds() | settings.kinds
     board_names = list(settings.boards)
@@ -415,21 +422,33 @@ def _check_curve(where: str, taxels: _Columns, pressure: Pressure) -> None:
 def _neighbours(
     position_m: Floats, normal: Floats, pitch_mm: Floats, parts: list[PartLayout]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Which taxels of a part are near each other and on the same side of it."""
-    firsts, seconds = [], []
+    """Which taxels of a part are near each other and on the same side of it.
+
+    Raises:
+        ConfigurationError: far more are near each other than can be, see `MOST_NEIGHBOURS`.
+    """
+    pairs: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
     for part in parts:
         taxels = slice(part.start, part.stop)
-        first, second = _pairs_along_an_axis(
+        most = max(MOST_PAIRS, MOST_NEIGHBOURS * part.n_taxels)
+        n = 0
+        for first, second in _pairs_along_an_axis(
             position_m[taxels], NEIGHBOUR_PITCHES * pitch_mm[taxels].max() * 1e-3
-        )
-        firsts.append(first + part.start)
-        seconds.append(second + part.start)
-    first, second = np.concatenate(firsts), np.concatenate(seconds)
-    apart = position_m[first] - position_m[second]
-    reach_mm = NEIGHBOUR_PITCHES * np.maximum(pitch_mm[first], pitch_mm[second])
-    near = np.sqrt(np.einsum("ij,ij->i", apart, apart)) * 1e3 <= reach_mm
-    near &= np.einsum("ij,ij->i", normal[first], normal[second]) > 0
-    first, second = first[near], second[near]
+        ):
+            first, second = first + part.start, second + part.start  # noqa: PLW2901
+            apart = position_m[first] - position_m[second]
+            reach_mm = NEIGHBOUR_PITCHES * np.maximum(pitch_mm[first], pitch_mm[second])
+            near = np.sqrt(np.einsum("ij,ij->i", apart, apart)) * 1e3 <= reach_mm
+            near &= np.einsum("ij,ij->i", normal[first], normal[second]) > 0
+            pairs.append((first[near], second[near]))
+            n += len(pairs[-1][0])
+            if n > most:
+                raise ConfigurationError(
+                    f"parts.{part.name}: more than {most} pairs of its {part.n_taxels} taxels are "
+                    "nearer to each other than the pitch of their kind allows; wanted each unit at "
+                    "a place of its own, places in mm and files of positions in m"
+                )
+    first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
     taxel, neighbour = np.concatenate([first, second]), np.concatenate([second, first])
     start = np.concatenate([[0], np.cumsum(np.bincount(taxel, minlength=len(position_m)))])
     return start.astype(np.int32), neighbour[np.lexsort((neighbour, taxel))].astype(np.int32)
@@ -437,8 +456,9 @@ def _neighbours(
 
 def _pairs_along_an_axis(
     position_m: Floats, reach_m: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Each pair of points once whose places on the axis of the greatest spread are in reach.
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Each pair of points once whose places on the axis of the greatest spread are in reach, some
+    at a time.
 
     A large part has few such pairs beside the square of its taxels.
     """
@@ -448,9 +468,17 @@ def _pairs_along_an_axis(
     number = np.arange(len(order))
     # A little more than the reach: the exact distance decides.
     after = np.searchsorted(along_m, along_m + reach_m * (1 + 1e-9), side="right") - number - 1
-    first = np.repeat(number, after)
-    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(after) - after, after)
-    return order[first], order[second]
+    before = np.append(0, np.cumsum(after))
+    begin = 0
+    while begin < len(order):
+        # One point at least, and more while they have few pairs together.
+        end = int(np.searchsorted(before, before[begin] + PAIRS_AT_ONCE, side="right")) - 1
+        end = max(end, begin + 1)
+        some = slice(begin, end)
+        first = np.repeat(number[some], after[some])
+        in_pair = np.arange(len(first)) - np.repeat(before[some] - before[begin], after[some])
+        yield order[first], order[first + 1 + in_pair]
+        begin = end
 
 
 def parts_of(layout: Layout, node: str) -> list[int]:

@@ -139,7 +139,8 @@ class Publisher:
             load_cbor2()
         self._node = node
         self._discovery_prefix = settings.discovery_prefix
-        self._identifier = f"skin-{robot}-{node}"
+        # No other node's: with dashes, node `b-c` of robot `a` would be node `c` of robot `a-b`.
+        self._identifier = f"{settings.base}/{robot}/{node}"
         self._command_handler = CommandHandler(handler) if handler and settings.commands else None
         self._drain_s = drain_s
         self._status = self.topics.node("status", node)

@@ -7,6 +7,7 @@ converts the bytes of a part to momentary pressures: by a parabola or a table pe
 """
 
 import sys
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -43,6 +44,9 @@ LEAST_SLOPE = 1e-3
 #: and a reading below zero would then be one of many units.
 STEEP_KNOT = 3
 
+#: Fewer pads with curves of their own do not represent the foam of their part.
+REPRESENTATIVES = 8
+
 #: A table is computed again when its baseline has moved this far. Until then it is shifted by the
 #: slope at rest, which is exact for small pressures only; so less is allowed where a pad is
 #: touched.
@@ -55,8 +59,8 @@ class CurveVerdict(IntEnum):
     """Result for a pad from a recording under known pressure. From NOISY on it is not used."""
 
     GOOD = 0
-    #: The recording does not show its curve, because it was not in it or hardly moved: it keeps the
-    #: common curve.
+    #: The recording does not show its curve, because it was not in it or hardly moved: see
+    #: `with_own`.
     UNKNOWN = 1
     #: Its expected error is too large.
     NOISY = 2
@@ -232,8 +236,21 @@ def common_curve(
 Curve = PressureCurve | TableCurve
 
 
-def with_own(common: PressureCurve, curves: Curves) -> Curve:
-    """Return own curves where taxels have one, the common one elsewhere."""
+def with_own(
+    common: PressureCurve, curves: Curves, parts: Sequence[slice], ungained: Mask
+) -> Curve:
+    """Return own curves where taxels have one; elsewhere that of the median pad of the part, as far
+    as its pads represent it, or the common one.
+
+    Pads of one foam differ by some tens of percent, other foam from the common curve by a factor of
+    five: a pad of which nothing is known is one like the others.
+
+    Args:
+        common: the curve of each taxel [n] without a recording under pressure.
+        curves: of these taxels.
+        parts: which taxels have the same foam.
+        ungained: bool[n], of which no gain is known, either.
+    """
     own = curves.own
     if not own.any():
         return common
@@ -241,7 +258,37 @@ def with_own(common: PressureCurve, curves: Curves) -> Curve:
     table = common.kpa(KNOTS_UNITS[:, np.newaxis]).T
     table = np.where((own & finite)[:, np.newaxis], curves.kpa, table)
     beyond_units = np.where(own, curves.beyond_units, common.beyond_units)
+    measured = own & finite & common.sound
+    unknown = ungained & common.sound & (curves.verdict == CurveVerdict.UNKNOWN)
+    for part in parts:
+        known, alike = (np.flatnonzero(mask[part]) + part.start for mask in (measured, unknown))
+        if len(known) >= REPRESENTATIVES and len(alike):
+            of_known = TableCurve(rising(curves.kpa[known]), curves.beyond_units[known])
+            table[alike], beyond_units[alike] = _typical(common, known, of_known, alike)
     return TableCurve(rising(table), beyond_units, np.where(own, finite, common.sound))
+
+
+def _typical(
+    common: PressureCurve, known: NDArray[np.intp], of_known: TableCurve, alike: NDArray[np.intp]
+) -> tuple[Floats, Floats]:
+    """Return the curves [k, knots] of taxels that read like the median of some known ones, and the
+    activations [k] up to which half of these were measured.
+
+    What is alike is capacitance: taxels that are sent in other units, or have thinner foam, have
+    the same pressure where the common curve has.
+    """
+    theirs = common.part(known)
+    reach_kpa = float(np.median(theirs.kpa(of_known.beyond_units)))
+    # Few kinds of pads make a skin.
+    kinds = np.column_stack([common.square[alike], common.linear[alike]])
+    table, beyond = np.empty((len(alike), len(KNOTS_UNITS))), np.empty(len(alike))
+    for kind in np.unique(kinds, axis=0):
+        mine = np.flatnonzero((kinds == kind).all(axis=1))
+        one = common.part(alike[mine[:1]])
+        units = theirs.units(one.kpa(KNOTS_UNITS[:, np.newaxis]))
+        table[mine] = np.median(of_known.kpa(units), axis=1)
+        beyond[mine] = one.units(reach_kpa)
+    return table, beyond
 
 
 class Reader(Protocol):

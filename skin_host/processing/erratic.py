@@ -1,11 +1,13 @@
 """Detects pads that jump to and fro: a broken contact, not a pressure.
 
 Pads jump faster than a hand, which is seen where sweeps come fast; or scatter beyond their measured
-range, see `scatter`.
+range, see `scatter`. Where most pads of a chip do, it is the chip whose contact is broken: the
+others, which have not been found yet or have less noise, are no measurement either.
 """
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +35,8 @@ RELIEF_PER_S = 0.25
 LIMIT = 2.0
 #: A pad stays erratic for this long after its last jumps.
 CALM_S = 60.0
+#: Fewer pads of one chip may jump each by itself.
+LEAST_OF_CHIP = 3
 
 
 class Erratic:
@@ -45,15 +49,26 @@ class Erratic:
     Args:
         step_kpa: [m], smallest step that cannot be noise; inf where it is not known.
         range_kpa: [m], pressure up to which each pad was measured.
+        chip: int[m], which chip each pad is read by, any numbering.
 
     Attributes:
-        pads: bool[m], the erratic pads; the array changes in place.
+        pads: bool[m], the erratic pads, and all pads of a chip with mostly such; the array changes
+            in place.
         any: whether there is one.
         suspects: whether any pad has jumped of late.
     """
 
-    def __init__(self, step_kpa: NDArray[np.float64], range_kpa: NDArray[np.float64]) -> None:
+    def __init__(
+        self,
+        step_kpa: NDArray[np.float64],
+        range_kpa: NDArray[np.float64],
+        chip: NDArray[np.integer[Any]],
+    ) -> None:
         m = len(step_kpa)
+        self._chip = np.unique(chip, return_inverse=True)[1].astype(np.intp)
+        #: Of each chip, how many pads must be erratic for the chip to be.
+        watched = np.bincount(self._chip[np.isfinite(step_kpa)], minlength=m)
+        self._enough = np.maximum(watched // 2 + 1, LEAST_OF_CHIP)
         self._step = step_kpa.astype(np.float32)
         self._scatter = Scatter(self._step, range_kpa.astype(np.float32))
         self._score = np.zeros(m, np.float32)
@@ -116,8 +131,17 @@ class Erratic:
 
     def _accuse(self, pads: NDArray[np.intp]) -> None:
         self._left_s[pads] = CALM_S
-        self.pads[pads] = True
-        self.any = True
+        self._mark()
+
+    def _mark(self) -> None:
+        """Mark the pads that have not been calm for long enough, and those of their chips."""
+        np.greater(self._left_s, 0.0, out=self.pads)
+        self.any = bool(self.pads.any())
+        if self.any:
+            found = np.bincount(self._chip[self.pads], minlength=len(self._enough))
+            broken: Mask = found >= self._enough
+            if broken.any():
+                np.logical_or(self.pads, broken[self._chip], out=self.pads)
 
     def _jumped(
         self,
@@ -164,8 +188,7 @@ class Erratic:
         """Let time pass, after which calm pads are no longer erratic."""
         if self.any:
             self._left_s -= dt_s
-            np.greater(self._left_s, 0.0, out=self.pads)
-            self.any = bool(self.pads.any())
+            self._mark()
 
 
 def step_kpa(curve: Curve, noise_units: NDArray[np.float64]) -> NDArray[np.float64]:

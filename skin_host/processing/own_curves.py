@@ -30,18 +30,33 @@ class OwnCurves:
     and remembered in each sweep, the others from the means of `pipeline.ROWS` sweeps: their
     reported pressures change as seldom.
 
+    Args:
+        curve: of the m taxels of a part.
+        curves: of all taxels.
+        mine: those of the part.
+        chip: int[m], which chip each of them is read by.
+        smoothing_s: of the filter of noise.
+
     Attributes:
         erratic: which of them jump.
     """
 
-    def __init__(self, curve: Curve, curves: Curves, mine: slice, smoothing_s: float) -> None:
+    def __init__(
+        self,
+        curve: Curve,
+        curves: Curves,
+        mine: slice,
+        chip: NDArray[np.int32],
+        smoothing_s: float,
+    ) -> None:
         own, noise = curves.own[mine], curves.noise_units[mine]
         m = len(own)
         self._own = own
         limit = np.where(own, limit_kpa(curve, noise), 0.0)
         self._smoother = StepFilter(limit, smoothing_s, np.float32)
         self._memory = make_memory(m, curves.memory, np.float32)
-        self.erratic = Erratic(np.where(own, step_kpa(curve, noise), np.inf), range_kpa(curve))
+        step = np.where(own, step_kpa(curve, noise), np.inf)
+        self.erratic = Erratic(step, range_kpa(curve), chip)
         self._zeros = np.zeros(m, np.float32)
         self._reported = self._zeros
         self._touched: Mask | None = None

@@ -250,7 +250,11 @@ class _Rules(NamedTuple):
         usable = calibration.usable & (layout.pad_kind == PadKind.PRESSURE)
         common = common_curve(layout, settings.pressure, calibration.gain, calibration.bend)
         curves = calibration.curves
-        curve = common if curves is None else with_own(common, curves)
+        curve: Curve = common
+        if curves is not None:
+            parts = [slice(part.start, part.stop) for part in layout.parts]
+            ungained = (calibration.gain == 1.0) & (calibration.bend == 1.0)
+            curve = with_own(common, curves, parts, ungained)
         above = calibration.percentile - calibration.baseline
         spread = calibration.spread
         if curves is not None:
@@ -367,12 +371,13 @@ class _PartPipeline:
         # The samples of a part are as seldom as its slowest board's sweeps.
         periods_ms = [layout.boards[board].settings.period_ms for board in part.boards]
         self._interval_s = max(max(periods_ms) * 1e-3, CONVERSION_S)
+        self._triangle_of = layout.triangle_of[mine]
         rules = rules.part(mine)
         self._set_model(rules)
         self.drift = BaselineTracker(
             skin.baseline[mine],
             rules.usable,
-            layout.triangle_of[mine],
+            self._triangle_of,
             self._thermal,
             rules.settings.drift,
         )
@@ -473,7 +478,9 @@ class _PartPipeline:
         self._piece_s = WINDOW_S
         if rules.curves is not None:
             smoothing_s = rules.settings.pressure.smoothing_s
-            self._own = OwnCurves(rules.curve, rules.curves, self._mine, smoothing_s)
+            self._own = OwnCurves(
+                rules.curve, rules.curves, self._mine, self._triangle_of, smoothing_s
+            )
             return
         # A model that permits it is stepped once a window, because the pipeline takes means anyway.
         # Steps of a second are large enough for float32.

@@ -5,6 +5,7 @@ gains are those of the boards that were pressed in it: limbs are fitted one afte
 """
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -430,8 +431,11 @@ def fit_curves(
         lag_s = find_lag(median_of_moving(units[:, pads], samples.dt_s), now_s, (time_s, kpa))
         pressure = np.interp(now_s + lag_s, time_s, kpa)
         steady = np.interp(now_s + lag_s, time_s, without_spikes(load).kpa)
+        follows = following(units, pressure, samples.dt_s)
+        rise_kpa = steady - np.median(steady[: max(round(samples.zero_s / samples.dt_s), 1)])
+        _check_unit(units, rise_kpa, follows & samples.usable, settings, layout)
         check_untouched(steady, samples.zero_s, samples.dt_s)
-        boards = _pressed_boards(following(units, pressure, samples.dt_s), samples, layout)
+        boards = _pressed_boards(follows, samples, layout)
         pressed = samples.received & boards
         course = replace(course, there=pads & boards, pressure_kpa=pressure, lag_s=lag_s)
         renewed = pressed & (shown(course) | ~pads)
@@ -451,6 +455,26 @@ def fit_curves(
     calibration = _renewed(samples, before, pressed, gain, bend, joined)
     known = memory is not None or unloads(steady)
     return Fitted(calibration, curves, pressed, ratio, pressed & ~renewed, known)
+
+
+def _check_unit(
+    units: Floats, rise_kpa: Floats, follows: Mask, settings: Settings, layout: Layout
+) -> None:
+    """Check that pressures may be in kPa, before they are compared with any.
+
+    Args:
+        units: activations [t, n].
+        rise_kpa: by how much the pressure [t] is above that of the zero.
+        follows: bool[n], pads that follow it.
+
+    Raises:
+        RequestError: see `check_ratio`.
+    """
+    top = PRESSED_QUANTILES[1]
+    if follows.any() and (high_kpa := float(np.quantile(rise_kpa, top))) > 0.0:
+        common = common_curve(layout, settings.processing.pressure).part(follows)
+        reads_kpa = common.kpa(np.quantile(units[:, follows], top, axis=0))
+        check_ratio(high_kpa / max(float(np.median(reads_kpa)), sys.float_info.min))
 
 
 def _check_share(fitted: Mask, pads: Mask, ratio: float) -> None:

@@ -123,7 +123,14 @@ def check_untouched(kpa: Floats, zero_s: float, dt_s: float) -> None:
         RequestError: there is a pressure that pads feel, over ambient or over the lowest.
     """
     zero_kpa = kpa[: max(round(zero_s / dt_s), 1)]
-    if float(zero_kpa.max()) - min(float(kpa.min()), 0.0) > UNTOUCHED_KPA:
+    lowest_kpa = float(kpa.min())
+    if float(zero_kpa.max()) - min(lowest_kpa, 0.0) > UNTOUCHED_KPA:
+        if float(zero_kpa.max()) - lowest_kpa <= UNTOUCHED_KPA:
+            raise RequestError(
+                f"no pressure is below {lowest_kpa:.0f} kPa: are they absolute, or has the sensor "
+                f"an offset? wanted kPa over ambient, {UNTOUCHED_KPA:g} or less while the skin is "
+                "untouched"
+            )
         raise RequestError(
             f"the first {zero_s:g} s of the recording, of which the zero is taken, are at "
             f"{zero_kpa.min():.0f} to {zero_kpa.max():.0f} kPa; wanted untouched skin then, at "

@@ -33,6 +33,28 @@ VERDICT_COLOURS = {
 }
 
 
+def check_format(output: Path) -> None:
+    """Check, without a recording, that a picture of this name can be made.
+
+    Raises:
+        RequestError: its suffix is another than those of `SUFFIXES`.
+        SkinError: matplotlib is not installed.
+    """
+    if output.suffix not in SUFFIXES:
+        raise RequestError(f"{output}: wanted a name that ends in one of {', '.join(SUFFIXES)}")
+    find_matplotlib()
+
+
+def find_matplotlib() -> Any:
+    """Return matplotlib, for pictures without a window.
+
+    Raises:
+        SkinError: it is not installed.
+    """
+    os.environ["MPLBACKEND"] = "agg"  # one that it does not know ends its import
+    return required("matplotlib", "pictures", "plots")
+
+
 def plot_pressure(series: Series, output: Path, part: str, taxels: list[int] | None = None) -> None:
     """Draw pressure over time: the named taxels, or the strongest ones; contacts as bars below.
 
@@ -249,8 +271,7 @@ def _pyplot() -> Any:
     Raises:
         SkinError: it is not installed.
     """
-    os.environ["MPLBACKEND"] = "agg"  # one that it does not know ends its import
-    mpl = required("matplotlib", "pictures", "plots")
+    mpl = find_matplotlib()
     mpl.use("Agg")
     mpl.rcParams["text.parse_math"] = False  # a recording's names may look like formulas
     from matplotlib import pyplot
@@ -259,8 +280,7 @@ def _pyplot() -> Any:
 
 
 def _write(figure: Any, output: Path) -> None:
-    if output.suffix not in SUFFIXES:
-        raise RequestError(f"{output}: wanted a name that ends in one of {', '.join(SUFFIXES)}")
+    check_format(output)
     buffer = BytesIO()
     figure.savefig(buffer, format=output.suffix[1:], dpi=110)
     _pyplot().close(figure)

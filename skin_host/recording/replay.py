@@ -30,13 +30,15 @@ from skin_host.errors import LogError, RequestError, SkinError, required, some_o
 from skin_host.files import whole_file
 from skin_host.health import HealthWatch
 from skin_host.health.diagnosis import named_by_part
-from skin_host.layout import Layout, load_skin
+from skin_host.layout import Layout, PadKind, load_skin
 from skin_host.mqtt.contact import PartContact, use_measurements
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration, Verdict, by_part
-from skin_host.processing.calibration.calibrator import NOISE_SAMPLES
+from skin_host.processing.calibration.calibrator import NOISE_SAMPLES, PRESSED_UNITS
 from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.core import Engine, Output, Step
+from skin_host.processing.masks import Mask
+from skin_host.processing.touch import levels
 from skin_host.recording import is_mcap
 from skin_host.recording.lines import LineWriter, health_line
 from skin_host.recording.turns import fed
@@ -46,6 +48,9 @@ if TYPE_CHECKING:
 
 #: A recording without a calibration file begins with this time of untouched skin.
 UNTOUCHED_S = 5.0
+#: A file's zero is another than a recording's where this share of a part's taxels begins touched by
+#: it, or as far below. Single ones may be touched.
+OTHER_ZERO_SHARE = 0.25
 #: A scheduler that does not answer within this time counts as absent.
 SCHEDULER_S = 10.0
 #: The frames of an only bus are in the recording's order, however long its batches are.
@@ -163,13 +168,21 @@ def _in_windows(
 
 
 def calibration_for(
-    log: Path, settings: Settings, layout: Layout, file: Path | None, seconds: float | None
+    log: Path,
+    settings: Settings,
+    layout: Layout,
+    file: Path | None,
+    seconds: float | None,
+    warn: Callable[[str], None] = lambda _: None,
 ) -> Calibration:
     """Return the calibration with which a recording is processed.
 
     The recording's first `seconds` are untouched and give the zero; if None, the file's zero is
     used, or without a file `UNTOUCHED_S`. With both, curves, gains and the foam's memory come from
     the file, as at the start of a daemon that calibrates.
+
+    `warn` is called with a sentence where zeros of file and recording show that one of them is not
+    that of this untouched skin.
 
     Raises:
         LogError: see `calibrate_from_log`.
@@ -179,9 +192,63 @@ def calibration_for(
     if file is not None:
         known = load_calibration(file, layout, skin_hash(settings))
         if seconds is None:
+            # A recording without a sweep in its first seconds shows nothing of its zero.
+            with suppress(LogError):
+                seen = calibrate_from_log(log, settings, layout, UNTOUCHED_S)
+                for doubt in _other_zero(known, seen, settings, layout, file):
+                    warn(doubt)
             return known
     zero = calibrate_from_log(log, settings, layout, seconds or UNTOUCHED_S)
-    return zero if known is None else calibrations.with_pressures_of(zero, known)
+    if known is None or file is None:
+        return zero
+    for doubt in _pressed_zero(known, zero, layout, file):
+        warn(doubt)
+    return calibrations.with_pressures_of(zero, known)
+
+
+def _other_zero(
+    known: Calibration, seen: Calibration, settings: Settings, layout: Layout, file: Path
+) -> list[str]:
+    """Return of which parts a file's zero is hardly that of a recording, a sentence each."""
+    above = known.percentile - known.baseline
+    enter = levels(above, known.spread, settings.processing.touch).enter
+    found = []
+    for name, both in _used_in_both(known, seen, layout):
+        off = both & (np.abs(seen.baseline - known.baseline) > enter)
+        number, of = np.count_nonzero(off), np.count_nonzero(both)
+        if number >= OTHER_ZERO_SHARE * of:
+            found.append(
+                f"by the zero of {file}, {number} of {of} taxels of {name} begin touched, or as "
+                "far below their zero: something presses them, or their boards were zeroed after "
+                f"it was taken; --calibrate-seconds {UNTOUCHED_S:g} takes the recording's own"
+            )
+    return found
+
+
+def _pressed_zero(known: Calibration, zero: Calibration, layout: Layout, file: Path) -> list[str]:
+    """Return which parts are pressed by the zero of a file while one is taken, a sentence each."""
+    found = []
+    for name, both in _used_in_both(known, zero, layout):
+        nearer = float(np.median((zero.baseline - known.baseline)[both]))
+        if nearer > PRESSED_UNITS:
+            found.append(
+                f"its first seconds, of which the zero is taken, are {nearer:.0f} units nearer to "
+                f"pressure on {name} than the zero of {file}: pressures will read too little if "
+                "something pressed it then; without --calibrate-seconds the file's zero is used"
+            )
+    return found
+
+
+def _used_in_both(
+    one: Calibration, other: Calibration, layout: Layout
+) -> Iterator[tuple[str, Mask]]:
+    """Yield the parts with their taxels [n] that are usable by two calibrations, if any are."""
+    usable = one.usable & other.usable & (layout.pad_kind == PadKind.PRESSURE)
+    for part in layout.parts:
+        both = np.zeros_like(usable)
+        both[part.start : part.stop] = usable[part.start : part.stop]
+        if both.any():
+            yield part.name, both
 
 
 def calibrate_from_log(
@@ -265,6 +332,28 @@ def doubts(calibration: Calibration, settings: Settings, layout: Layout) -> list
             f"{named_by_part(without)} {have} no zero ({', '.join(sorted(reasons))}) and {are} not "
             "valid"
         )
+    found += _foreign_curves(calibration, layout)
+    return found
+
+
+def _foreign_curves(calibration: Calibration, layout: Layout) -> list[str]:
+    """Return of which parts most pads were not in the recording of their curves, a sentence each.
+
+    So it is with curves of another skin of this configuration, in which other pads work.
+    """
+    if calibration.curves is None:
+        return []
+    own = calibration.curves.own
+    gained = (calibration.gain != 1.0) | (calibration.bend != 1.0)
+    found = []
+    for name, used in _used_in_both(calibration, calibration, layout):
+        without, of = np.count_nonzero(used & ~own & ~gained), np.count_nonzero(used)
+        if (used & own).any() and 2 * without > of:
+            found.append(
+                f"{without} of {of} usable taxels of {name} have no curve of their own, as their "
+                "readings were not in the recording under known pressure: is the calibration that "
+                "of this skin? wanted a recording under known pressure with these taxels"
+            )
     return found
 
 
@@ -388,7 +477,9 @@ def process(
         LogError, CalibrationError, ConfigurationError: a file is wrong.
     """
     settings, layout = load_skin(task.config)
-    found = calibration_for(task.log, settings, layout, task.calibration, task.calibrate_seconds)
+    found = calibration_for(
+        task.log, settings, layout, task.calibration, task.calibrate_seconds, warn
+    )
     for doubt in doubts(found, settings, layout):
         warn(doubt)
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)

@@ -11,39 +11,15 @@ sets up has another zero from then on, of which a daemon would have informed its
 
 from collections.abc import Iterable, Iterator
 
-import numpy as np
-
-from skin_host.bus.commands import (
-    Message,
-    SetBoardConfig,
-    SetTriangleConfig,
-    TactileSetup,
-    TactileSetup2,
-    parse_command,
-)
+from skin_host.bus.commands import cut_where_zeroed
 from skin_host.bus.ledger import LONGEST_DISORDER_NS
-from skin_host.bus.wire import (
-    BROADCAST_ADDRESS,
-    HOST_ADDRESS,
-    FrameBatch,
-    MessageClass,
-    RecordBatch,
-)
+from skin_host.bus.wire import BROADCAST_ADDRESS, FrameBatch
 from skin_host.errors import LogError
 from skin_host.processing.core import EXPIRE_NS, Engine, Output
 
 #: After so long without a frame every board is silent, whatever its settings, and all that touched
 #: it has ended as lost. The rest of a gap changes nothing more, but what may drift in it.
 LONGEST_STEPPED_NS = 60_000_000_000
-#: Commands after which a board has another zero.
-ZEROING: tuple[type[Message], ...] = (
-    SetBoardConfig,
-    SetTriangleConfig,
-    TactileSetup,
-    TactileSetup2,
-)
-_COMMANDS = int(MessageClass.ANALOG_COMMAND) << 8 | HOST_ADDRESS << 4
-_ADDRESSES = 0xF
 
 
 def fed(
@@ -140,21 +116,7 @@ class _Turns:
         """Yield a batch in pieces, cut where the host gives a board another zero; note that in
         between.
         """
-        rows = np.flatnonzero(batch.id & ~np.uint32(_ADDRESSES) == _COMMANDS).tolist()
-        begin = 0
-        whole: RecordBatch | None = None
-        for row in rows:
-            payload = batch.data[row, : batch.dlc[row]].tobytes()
-            parsed = parse_command(int(batch.id[row]), payload)
-            if parsed is None or not isinstance(parsed[1], ZEROING):
-                continue
-            if whole is None:
-                whole = RecordBatch(batch.id, batch.dlc, batch.data, batch.t_ns)
-            if row > begin:
-                yield whole[begin:row]
-            begin = row
-            self._zeroed(bus, parsed[0])
-        yield batch if whole is None else whole[begin:]
+        yield from cut_where_zeroed(batch, lambda address, *_: self._zeroed(bus, address))
 
     def _zeroed(self, bus: str, address: int) -> None:
         """Inform the engine of another zero of a board, or of all boards of a bus."""

@@ -1,6 +1,9 @@
 """Small messages and files that unfold into hours or gigabytes are refused at once."""
 
+import contextlib
+import sqlite3
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
+from skin_host.bus.sqlite import BoundedSqliteReader
 from skin_host.config.settings import load
 from skin_host.errors import LogError
 from skin_host.mqtt.frames import decode_frame
@@ -129,3 +133,78 @@ def test_a_blf_recording_that_unfolds_or_never_ends_is_refused(
         or "object of" in str(refused.value)
         or "short" in str(refused.value)
     )
+
+
+FRAME = (
+    "1700000000.0 AS ts, 1248 AS arbitration_id, 0 AS extended, 0 AS remote, 0 AS error, 8 AS dlc"
+)
+ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
+COLUMNS = "ts REAL, arbitration_id INTEGER, extended, remote, error, dlc INTEGER"
+ROW = "INSERT INTO messages VALUES (1700000000.0, 1248, 0, 0, 0, 8, {})"
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    ("statements", "why"),
+    [
+        (
+            [f"CREATE VIEW messages AS {ENDLESS} SELECT {FRAME}, x'40' AS data FROM c"],
+            "`messages` is view; wanted a table",
+        ),
+        (
+            [f"CREATE VIEW Messages AS {ENDLESS} SELECT {FRAME}, x'40' AS data FROM c WHERE 0"],
+            "`messages` is view; wanted a table",
+        ),
+        (
+            [
+                f"CREATE TABLE messages ({COLUMNS}, data AS (zeroblob(900000000)))",
+                ROW.removesuffix(", {})") + ")",
+            ],
+            "`messages` has the computed column data",
+        ),
+        ([f"CREATE TABLE messages ({COLUMNS}, data)", ROW.format(2_000_000_000)], "no frame"),
+        ([f"CREATE TABLE messages ({COLUMNS}, data)", ROW.format("'x'")], "no frame"),
+        ([f"CREATE TABLE messages ({COLUMNS}, data)", ROW.format("zeroblob(9000000)")], "too big"),
+        (["CREATE TABLE others (x)"], "`messages` is not there"),
+        (["CREATE TABLE messages (x)", "INSERT INTO messages VALUES (1)"], "no frame"),
+    ],
+)
+def test_a_database_that_unfolds_or_never_ends_is_refused(
+    tmp_path: Path, statements: list[str], why: str
+) -> None:
+    path = tmp_path / "x.db"
+    with contextlib.closing(sqlite3.connect(path)) as made, made:
+        for statement in statements:
+            made.execute(statement)
+    settings = load(Path(__file__).parents[2] / "config" / "demo.toml")
+    tracemalloc.start()
+    try:
+        with pytest.raises(LogError, match=why) as refused:
+            list(read_buses(path, settings))
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_a_database_of_python_can_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "x.db"
+    sent = [
+        can.Message(
+            timestamp=1700000000.0 + i,
+            arbitration_id=0x4E4,
+            data=bytes(i % 9),
+            is_extended_id=False,
+        )
+        for i in range(100)
+    ]
+    with can.SqliteWriter(path) as writer:
+        for message in sent:
+            writer(message)
+    with BoundedSqliteReader(path) as reader:
+        read = list(reader)
+    assert [bytes(one.data) for one in read] == [bytes(one.data) for one in sent]
+    with BoundedSqliteReader(path) as reader:
+        reader._most_rows = 99  # as where pages are named twice
+        with pytest.raises(ValueError, match="more rows than the file has bytes"):
+            list(reader)

@@ -1,14 +1,16 @@
 """A bus between two processes: what one end sends the other receives, in whole batches."""
 
+import socket
+
 import numpy as np
 import pytest
 
 from skin_host.bus.opening import open_port
-from skin_host.bus.pair import LONGEST_LAG_NS, MOST_FRAMES, PAIR, PairBus, pair
+from skin_host.bus.pair import LONGEST_LAG_NS, MOST_FRAMES, PAIR, PairBus, hand_over, pair
 from skin_host.bus.port import LinkState, Port
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Bus, Receive
-from skin_host.errors import BusError
+from skin_host.errors import ConfigurationError
 
 
 def batch(n: int) -> FrameBatch:
@@ -18,7 +20,7 @@ def batch(n: int) -> FrameBatch:
 
 def opened() -> tuple[PairBus, Port]:
     ours, theirs = pair()
-    port = open_port("can0", Bus(interface=PAIR, channel=str(ours.detach())), Receive())
+    port = open_port("can0", Bus(interface=PAIR, channel=hand_over(ours)), Receive())
     return PairBus(theirs), port
 
 
@@ -105,6 +107,22 @@ def test_an_end_that_was_closed_is_gone() -> None:
     port.close()
 
 
-def test_a_channel_that_is_no_socket_is_refused() -> None:
-    with pytest.raises(BusError, match="wanted the number of a socket"):
-        open_port("can0", Bus(interface=PAIR, channel="can0"), Receive())
+@pytest.mark.parametrize("channel", ["can0", "0", "9" * 20, "-1", "socket"])
+def test_a_configuration_cannot_name_a_descriptor_of_this_process(channel: str) -> None:
+    """An event loop's own socket would be read, and closed, as if it were a bus."""
+    with socket.socket() as own:
+        if channel == "socket":
+            channel = str(own.fileno())
+        for wait in (False, True):
+            with pytest.raises(ConfigurationError, match="of `skin demo` alone"):
+                open_port("can0", Bus(interface=PAIR, channel=channel), Receive(), wait=wait)
+        assert own.fileno() >= 0
+
+
+def test_an_end_is_handed_over_once() -> None:
+    ours, theirs = pair()
+    settings = Bus(interface=PAIR, channel=hand_over(ours))
+    open_port("can0", settings, Receive()).close()
+    with pytest.raises(ConfigurationError):
+        open_port("can0", settings, Receive())
+    theirs.close()

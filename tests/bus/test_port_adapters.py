@@ -15,6 +15,7 @@ from skin_host.bus.opening import open_bus, open_port
 from skin_host.bus.port import LinkState, Port
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Receive
+from skin_host.errors import BusError
 from tests.support.datagrams import FRAME
 from tests.support.waiting import PATIENCE_S
 
@@ -312,3 +313,21 @@ def test_fd_frames_over_multicast_hold_up_no_others():
         assert port.read().id.tolist() == [0x410]
     near.shutdown()
     port.close()
+
+
+@pytest.mark.parametrize(
+    ("interface", "extra"), [("slcan", "serial"), ("serial", "serial"), ("gs_usb", "gs-usb")]
+)
+def test_an_adapter_whose_package_is_not_installed_names_it(monkeypatch, interface, extra):
+    def absent(*_, **__):
+        raise can.CanInterfaceNotImplementedError("the module is not installed")
+
+    monkeypatch.setattr("can.Bus", absent)
+    with pytest.raises(BusError, match=rf"mend it with: pip install 'python-can\[{extra}\]'"):
+        open_bus("left", Bus(interface=interface, channel="/dev/none"))
+
+
+def test_an_adapter_that_lacks_its_options_names_where_they_are_given():
+    wanted = r"'host' and 'port'; .* from \[buses\.left\.options\]"
+    with pytest.raises(BusError, match=wanted):
+        open_bus("left", Bus(interface="socketcand", channel="can0"))

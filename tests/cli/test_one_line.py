@@ -26,16 +26,30 @@ def test_a_scan_that_nobody_answers_has_failed(
     assert (json.loads(told.out) if more else told.out) == ({"boards": []} if more else "")
 
 
-@pytest.mark.parametrize("options", [["--channel", ""], ["--interface", ""]])
-@pytest.mark.parametrize("command", [["scan"], ["emulate", "a.toml"]])
-def test_an_empty_name_is_refused(
-    command: list[str], options: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["scan", "--channel"],
+        ["scan", "--interface"],
+        ["emulate", "a.toml", "--channel"],
+        ["emulate", "a.toml", "--interface"],
+        ["listen", "--part"],
+        ["listen", "--robot"],
+        ["status", "--robot"],
+        ["view", "--host"],  # it would be every address of this machine
+        ["view", "--foxglove", "--host"],
+        ["view", "--name"],
+        ["record", "a.mcap", "--robot"],
+        ["replay", "a.mcap", "--onto", "broker", "--robot"],
+    ],
+)
+def test_an_empty_name_is_refused(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """It is that of a variable of the shell that is not set."""
     with pytest.raises(SystemExit) as end:
-        main([*command, *options])
+        main([*command, ""])
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"argument {options[0]}: seen '', wanted a name" in line
+    assert f"argument {command[-1]}: seen '', wanted a name" in line
 
 
 def test_a_bus_without_a_channel_is_found_by_the_check(

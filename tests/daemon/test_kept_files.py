@@ -418,3 +418,55 @@ async def test_of_two_writes_of_the_zeros_the_newer_one_stays_however_long_the_f
         # One that begins only now is not written any more.
         daemon._write_zeros(older)
         assert load_kept(file, Zeros) == newer
+
+
+@pytest.mark.parametrize("configuration", ["other", "same", "damaged"])
+def test_a_calibration_of_another_configuration_is_kept_when_a_new_one_takes_its_name(
+    kept: tuple[Any, Any, Path],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path,
+    configuration: str,
+) -> None:
+    """It may hold curves that were fitted. What was touched is known all the same."""
+    settings, layout, path = kept
+    found = stored_calibration(settings, layout, "main")
+    assert found is not None
+    zeros = Zeros(calibration=found.id, touched={"left_hand": [7]}, parts=["left_hand"])
+    write_document(path.with_name("demo-main.zeros.json"), zeros)
+    before = path.read_text()
+    if configuration == "other":
+        before = before.replace(f'"{found.configuration}"', '"0123456789ab"')
+    elif configuration == "damaged":
+        before = before[:1000]
+    path.write_text(before)
+    seen: list[Any] = []
+
+    async def take(*_: Any, touched: Any) -> Any:
+        seen.append(touched)
+        return found
+
+    monkeypatch.setattr("skin_host.daemon.calibrate.take_calibration", take)
+    config = tmp_path / "robot.toml"
+    more = f'\n[mqtt]\nport = 1\n[service]\nstate_directory = "{tmp_path}"\n'
+    config.write_text(CONFIG.read_text() + more)
+    assert main(["calibrate", str(config)]) == 0
+    assert stored_calibration(settings, layout, "main") is not None
+    assert seen == [{"left_hand": [7]}]
+    former = [one for one in tmp_path.iterdir() if ".former-" in one.name]
+    assert [one.read_text() for one in former] == ([before] if configuration == "other" else [])
+    assert ("fit them again" in caplog.text) == (configuration == "other")
+
+
+@stepped
+async def test_a_daemon_keeps_the_calibration_of_another_configuration_too(
+    clock: SteppedClock, can_bus_settings: Bus, kept: tuple[Any, Any, Path]
+) -> None:
+    *_, path = kept
+    configuration = json.loads(path.read_text())["configuration"]
+    before = path.read_text().replace(f'"{configuration}"', '"0123456789ab"')
+    path.write_text(before)
+    async with living(can_bus_settings, path.parent, clock=clock):
+        (former,) = [one for one in path.parent.iterdir() if ".former-" in one.name]
+        assert former.read_text() == before
+        assert json.loads(path.read_text())["configuration"] == configuration

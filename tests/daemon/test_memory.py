@@ -203,6 +203,109 @@ def test_the_whole_node_takes_over_what_each_share_knows_of_its_parts(skin: Skin
     assert memory.state.disabled == ["c"]
 
 
+class Moved:
+    """The same robot, of which part `a` is another node's."""
+
+    def __init__(self, skin: Skin, node: str) -> None:
+        self.skin = skin
+        self.settings = changed(skin.settings, {"parts.a.node": node})
+        self.layout = build_layout(self.settings, Path())
+
+    def start(self, node: str) -> NodeMemory:
+        return remembered(self.settings, self.layout, node)
+
+
+def known_of_all(skin: Skin, written_s: float) -> Calibration:
+    """Let `main` have had all parts, each with something that is known of its zeros."""
+    calibration = skin.calibration(3.0, 0)
+    kept = {part: [number] for number, part in enumerate(PARTS)}
+    zeros = Zeros(
+        calibration=calibration.id,
+        unknown=kept,
+        stuck=kept,
+        touched=kept,
+        baselines=skin.baselines(4.0, *PARTS),
+        parts=[*PARTS, TIP],
+        written=after(written_s),
+    )
+    thresholds = Thresholds(margin_units=5.0)
+    skin.keep("main", calibration, zeros, NodeState(disabled=["a"], thresholds=thresholds))
+    return calibration
+
+
+def test_a_node_knows_what_the_node_that_had_its_part_before_has_kept(skin: Skin) -> None:
+    """Without that it would take a new zero, whatever presses the part."""
+    calibration = known_of_all(skin, 10)
+    moved = Moved(skin, "arm")
+    memory = moved.start("arm")
+    assert memory.from_others
+    assert memory.calibration is not None
+    assert memory.calibration.id == calibration.id
+    for found in (memory.zeros.unknown, memory.zeros.stuck, memory.zeros.touched):
+        assert found == {"a": [0]}
+    assert memory.zeros.baselines == skin.baselines(4.0, "a")
+    assert (memory.state.disabled, memory.state.thresholds.margin_units) == (["a"], 5.0)
+    # It has files of its own from now on.
+    assert not moved.start("arm").from_others
+    assert moved.start("arm").zeros == memory.zeros
+    assert moved.start("main").zeros.touched == {"b": [1], "c": [2]}
+
+
+def test_a_node_that_gets_a_part_back_knows_what_became_of_it_meanwhile(skin: Skin) -> None:
+    known_of_all(skin, 10)
+    arm = skin.calibration(6.0, 20, ["a"])
+    zeros = Zeros(calibration=arm.id, touched={"a": [5]}, parts=["a"], written=after(25))
+    skin.keep("arm", arm, zeros)
+    memory = skin.start()
+    assert (skin.level(memory, "a"), memory.zeros.touched["a"]) == (6.0, [5])
+    assert memory.zeros.touched["b"] == [1]
+    # A calibration of its other parts, with what it had known of that one.
+    later = skin.calibration(9.0, 30)
+    zeros = Zeros(calibration=later.id, parts=["b", "c", TIP], written=after(31))
+    skin.keep("main", later, zeros)
+    memory = skin.start()
+    assert (skin.level(memory, "a"), memory.zeros.touched) == (6.0, {"a": [5]})
+    assert skin.level(memory, "b") == 9.0
+    # One of all that was taken without a daemon since.
+    skin.keep("main", skin.calibration(12.0, 40))
+    memory = skin.start()
+    assert (skin.level(memory, "a"), memory.zeros.touched) == (12.0, {})
+
+
+def test_a_part_of_which_only_a_calibration_of_another_node_is_left_is_in_doubt(skin: Skin) -> None:
+    calibration = known_of_all(skin, 10)
+    moved = Moved(skin, "arm")
+    zeros = Zeros(calibration=calibration.id, parts=["b", "c", TIP], written=after(12))
+    skin.keep("main", zeros=zeros)
+    memory = moved.start("arm")
+    assert skin.level(memory, "a") == 3.0
+    assert memory.zeros.unknown == {"a": skin.pads("a")}
+
+
+def test_files_of_other_nodes_change_nothing_of_a_node_that_has_its_own(
+    skin: Skin, caplog: pytest.LogCaptureFixture
+) -> None:
+    known_of_all(skin, 10)
+    before = skin.start()
+    # Another node's, damaged; one's of earlier; and another robot's node of the same file name.
+    skin.path("arm", "zeros").write_text("{")
+    skin.keep("arm", skin.calibration(9.0, 90))
+    early = skin.calibration(8.0, -20)
+    zeros = Zeros(calibration=early.id, touched={"a": [7]}, parts=["a"], written=after(-10))
+    skin.keep("leg", early, zeros)
+    skin.keep("x-main", zeros=Zeros(robot="body-x", parts=["a"], written=after(99)))
+    memory = skin.start()
+    assert memory.calibration is not None
+    assert before.calibration is not None
+    assert memory.calibration.id == before.calibration.id
+    assert (memory.zeros, memory.state) == (before.zeros, before.state)
+    assert not memory.from_others
+    assert "damaged" not in caplog.text
+    assert not [
+        path for path in skin.path("arm", "zeros").parent.iterdir() if "damaged" in path.name
+    ]
+
+
 def test_files_of_an_older_version_are_handed_over_too(skin: Skin) -> None:
     """They do not name their parts; the baselines that every end keeps do."""
     calibration = skin.calibration(3.0, 0)

@@ -5,10 +5,9 @@ from pathlib import Path
 import can
 import numpy as np
 
-from skin_host.bus.commands import parse_command
+from skin_host.bus.commands import ZEROING, parse_command
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
-from skin_host.recording.turns import ZEROING
 from tests.support.live import living
 from tests.support.stepped import stepped
 

@@ -3,13 +3,14 @@
 import os
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from emulator import state
-from emulator.faults import parse
-from emulator.probes.scene import Place, Probe, Scene
+from emulator.faults import KINDS, parse
+from emulator.probes.scene import Fault, Place, Probe, Scene
 from emulator.probes.scene import load as load_scene
 from emulator.robot import Robot
 from emulator.state import StateError
@@ -138,3 +139,52 @@ def test_a_state_calls_nothing_but_the_emulators_own(call: tuple[object, ...]) -
 
     with pytest.raises(StateError, match="the state names"):
         Robot.restore(head + pickle.dumps(_Evil(*call)), *configuration)
+
+
+class _Calls:
+    """Calls a method of an object when it is read; `owner` is found in the state itself."""
+
+    def __init__(self, method: object, *arguments: object) -> None:
+        self._call = method, arguments
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return self._call
+
+
+def test_a_state_cannot_have_its_robot_write_files(tmp_path: Path) -> None:
+    """Whoever reads a state of somebody else would lose a file of their own."""
+    configuration = skin()
+    robot = Robot(*configuration)
+    kept = tmp_path / "kept"
+    kept.write_text("kept")
+    for method, *arguments in ((robot.write, kept), (robot.step, 1e9), (Robot.read, kept)):
+        wrong = state.save(_Calls(method, *arguments), configuration)
+        with pytest.raises(StateError, match="the state names"):
+            Robot.restore(wrong, *configuration)
+    assert kept.read_text() == "kept"
+
+
+@pytest.mark.parametrize("fidelity", ["signal", "chip"])
+@pytest.mark.parametrize("name", ["demo", "fingertips"])
+def test_a_robot_with_any_fault_can_be_saved(name: str, fidelity: str) -> None:
+    configuration = skin(name)
+    robot = Robot(*configuration, fidelity=fidelity)
+    robot.bring_up()
+    places: dict[str, Any] = {
+        "board": next(iter(robot.boards)),
+        "bus": next(iter(robot.wires)),
+        "triangle": configuration[1].boards[0].triangles[0],
+        "taxel": 3,
+    }
+    for kind, of_kind in KINDS.items():
+        named = {key: places[key] for key in of_kind.needs}
+        if of_kind.aim is not None:
+            named["value"] = 2.0  # another line or address than its own
+        if of_kind.on != "skin" and robot.fingertips.boards:
+            named["board"] = next(iter(robot.fingertips.boards))
+        elif of_kind.on == "fingertip":
+            continue
+        alone = Robot.restore(robot.save(), *configuration)
+        alone.inject(Fault(name=kind, until_s=0.1, **named))
+        alone.step(0.05)
+        Robot.restore(alone.save(), *configuration).step(0.2)

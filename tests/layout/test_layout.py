@@ -2,6 +2,7 @@
 
 import os
 import re
+import tracemalloc
 from pathlib import Path
 
 import msgspec
@@ -434,3 +435,51 @@ def test_a_part_without_a_pressure_pad_is_refused_and_a_triangle_without_one_is_
     )
     layout = build_layout(skin({"triangles": "0"}, patch, kinds=thermal), HERE)
     assert np.count_nonzero(layout.pad_kind == PadKind.THERMAL) == 12
+
+
+def body(boards: int, places: list[dict[str, float]]) -> Settings:
+    """A robot of one part, each of its boards with a triangle at each of these places."""
+    names = [f"b{number}" for number in range(boards)]
+    patch = {"triangles": f"0-{len(places) - 1}", "places": places}
+    return msgspec.convert(
+        {
+            "robot": "test",
+            "buses": {f"can{bus}": {} for bus in range(-(-boards // 14))},
+            "boards": {
+                name: {"bus": f"can{number // 14}", "address": number % 14 + 1}
+                for number, name in enumerate(names)
+            },
+            "parts": {"arm": {"patches": [{"board": name, **patch} for name in names]}},
+        },
+        Settings,
+    )
+
+
+def test_thousands_of_taxels_at_one_place_are_refused_before_they_fill_the_memory() -> None:
+    """As from a file of positions in another unit: their pairs grow with the square."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(
+            ConfigurationError, match=r"parts\.arm: more than .* of its 10752 taxels .* in mm"
+        ):
+            build_layout(body(56, [{}] * 16), HERE)
+        assert tracemalloc.get_traced_memory()[1] < 200e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_few_taxels_at_one_place_are_neighbours() -> None:
+    layout = build_layout(body(1, [{}] * 4), HERE)
+    assert {0, 12, 24, 36} - {0} <= neighbours(layout, 0)
+
+
+def test_neighbours_do_not_depend_on_how_many_pairs_are_looked_at_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = skin({"triangles": "0-15"})
+    whole = build_layout(settings, HERE)
+    for at_once in (1, 7, 100):
+        monkeypatch.setattr("skin_host.layout.PAIRS_AT_ONCE", at_once)
+        some = build_layout(settings, HERE)
+        assert (some.neighbour_start == whole.neighbour_start).all()
+        assert (some.neighbour == whole.neighbour).all()

@@ -112,6 +112,33 @@ async def test_everything_put_arrives_as_the_contract_says(
         assert properties.MessageExpiryInterval == 1
 
 
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (("skin", "a", "b-c"), ("skin", "a-b", "c")),
+        (("hall1", "r", "main"), ("hall2", "r", "main")),
+    ],
+)
+async def test_nodes_of_two_robots_never_have_one_name_at_the_broker(
+    mosquitto: Mosquitto, one: tuple[str, str, str], other: tuple[str, str, str]
+) -> None:
+    """The broker would end the connection of each when the other one comes."""
+
+    def node(base: str, robot: str, name: str) -> Publisher:
+        return Publisher(settings(mosquitto, base=base), robot, name)
+
+    async with node(*one) as first:
+        await until(lambda: first.counters.connected)
+        async with node(*other) as second:
+            await until(lambda: second.counters.connected)
+            for publisher in (first, second):
+                publisher.put_contact("palm", "ON")
+            async with listening(mosquitto, "#") as seen:
+                await until(lambda: len(seen.payloads("/palm/contact")) == 2)
+            assert first.counters.connections == second.counters.connections == 1
+    assert "already connected" not in mosquitto.log
+
+
 async def test_frames_have_the_boards_bytes_for_as_long_as_they_are_asked_for(
     mosquitto: Mosquitto,
 ) -> None:

@@ -25,7 +25,7 @@ def look(found: Erratic, *kpa: float, period_s: float = PERIOD_S) -> None:
 
 
 def jumping(looks: int) -> Erratic:
-    found = Erratic(np.array([STEP_KPA, STEP_KPA, np.inf]), np.full(3, np.inf))
+    found = Erratic(np.array([STEP_KPA, STEP_KPA, np.inf]), np.full(3, np.inf), np.zeros(3, int))
     for _ in range(looks):
         look(found, 0, 9, 0, 9)
     return found
@@ -146,6 +146,57 @@ def test_an_erratic_pad_is_believed_again_when_it_was_calm_for_a_minute():
     found.pass_time(1.0)
     assert not found.any
     assert not found.pads.any()
+
+
+#: Two chips; the last pad of each has no curve of its own, so nothing is known of its jumps.
+CHIP = np.array([7, 7, 7, 7, 7, 7, 2, 2, 2, 2])
+WATCHED = np.array([True] * 5 + [False] + [True] * 3 + [False])
+
+
+def of_chips(*jumping_pads: int) -> Erratic:
+    found = Erratic(np.where(WATCHED, STEP_KPA, np.inf), np.full(len(CHIP), np.inf), CHIP)
+    rows = np.zeros((8, len(CHIP)), np.float32)
+    rows[1::2, list(jumping_pads)] = 9.0
+    for _ in range(10):
+        found.look(rows, [PERIOD_S] * len(rows))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("jumping_pads", "erratic"),
+    [
+        ([0, 1], [0, 1]),
+        ([0, 1, 2], [0, 1, 2, 3, 4, 5]),
+        ([6, 7], [6, 7]),
+        ([6, 7, 8], [6, 7, 8, 9]),
+        ([0, 1, 6, 7], [0, 1, 6, 7]),
+        ([0, 1, 4, 6, 7, 8], list(range(10))),
+    ],
+)
+def test_no_pad_of_a_chip_is_read_while_most_of_them_jump(
+    jumping_pads: list[int], erratic: list[int]
+):
+    """Of those whose jumps are known; two may jump each by itself."""
+    assert np.flatnonzero(of_chips(*jumping_pads).pads).tolist() == erratic
+
+
+def test_pads_of_a_chip_are_read_again_as_soon_as_few_of_them_are_erratic():
+    found = of_chips(0, 1)
+    found.pass_time(30.0)
+    rows = np.zeros((8, len(CHIP)), np.float32)
+    rows[1::2, [0, 1, 2]] = 9.0
+    for _ in range(10):
+        found.look(rows, [PERIOD_S] * len(rows))
+    rows[:, 2] = 0.0
+    found.look(rows, [PERIOD_S] * len(rows))
+    found.pass_time(59.0)
+    assert np.flatnonzero(found.pads).tolist() == [0, 1, 2, 3, 4, 5]
+    for _ in range(10):
+        found.look(rows, [PERIOD_S] * len(rows))
+    found.pass_time(2.0)
+    assert np.flatnonzero(found.pads).tolist() == [0, 1]
+    found.reset(np.array([True] * 2 + [False] * 8))
+    assert not found.any
 
 
 @pytest.mark.parametrize("jumps", [0, 10])

@@ -13,8 +13,9 @@ import pytest
 
 from skin_host.cli import main
 from skin_host.layout import load_skin
-from skin_host.processing.calibration import Verdict
+from skin_host.processing.calibration import Verdict, with_curves
 from skin_host.processing.calibration.file import save_calibration
+from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict
 from skin_host.recording.export import read_frames
 from skin_host.recording.replay import calibrate_from_log, doubts
 from tests.support.candump import write_config, write_log
@@ -168,3 +169,76 @@ def test_an_export_of_frames_holds_the_health_at_its_end(config: Path, tmp_path:
     assert (line.part, line.state) == ("arm", "warning")
     assert line.text.startswith(f"arm: warning; {WORDS}: touched when calibrated")
     assert line.t_ns == 1_700_000_000 * 10**9 + 139 * 50_000_000 + 31 * 125_000
+
+
+def zeroed_elsewhere(config: Path, folder: Path, units: float) -> Path:
+    """A calibration file whose zero is so many units further from pressure than the recordings."""
+    settings, layout = load_skin(config)
+    log = write_log(folder / "before.log", 140, untouched)
+    found = calibrate_from_log(log, settings, layout, 5.0)
+    moved = replace(found, baseline=found.baseline - units, percentile=found.percentile - units)
+    save_calibration(folder / "known.json", moved, layout)
+    return folder / "known.json"
+
+
+def warnings_of(
+    config: Path, folder: Path, log: Path, options: Sequence[str], capsys: Any
+) -> list[str]:
+    command = ["replay", str(log), "--config", str(config), "--output", str(folder / "b.jsonl")]
+    assert main([*command, *options]) == 0
+    lines: list[str] = capsys.readouterr().err.splitlines()
+    return lines
+
+
+@pytest.mark.parametrize("units", [5.0, -5.0])
+def test_a_recording_whose_pads_rest_elsewhere_than_by_the_zero_of_the_file_is_named(
+    units: float, config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As of another day, after which the boards were zeroed: half of the skin was touched."""
+    known = zeroed_elsewhere(config, tmp_path, units)
+    log = write_log(tmp_path / "b.log", 140, untouched)
+    (line,) = warnings_of(config, tmp_path, log, ["--calibration", str(known)], capsys)
+    assert line.startswith(f"warning: {log}: by the zero of {known}, 192 of 192 taxels of arm")
+    assert line.endswith("--calibrate-seconds 5 takes the recording's own")
+    own = ["--calibration", str(known), "--calibrate-seconds", "5"]
+    assert warnings_of(config, tmp_path, log, own, capsys) == []
+
+
+def test_a_recording_with_the_zero_of_the_file_that_begins_with_a_grip_gives_no_warning(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = zeroed_elsewhere(config, tmp_path, 0.0)
+    log = write_log(tmp_path / "b.log", 140, lambda period: range(40))
+    assert warnings_of(config, tmp_path, log, ["--calibration", str(known)], capsys) == []
+    short = write_log(tmp_path / "c.log", 3, untouched)
+    assert warnings_of(config, tmp_path, short, ["--calibration", str(known)], capsys) == []
+
+
+def test_a_zero_of_a_recording_that_begins_pressed_as_a_whole_is_named_by_that_of_the_file(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its readings alone do not show it: all pads are as steady as untouched ones."""
+    known = zeroed_elsewhere(config, tmp_path, 0.0)
+    log = write_log(tmp_path / "b.log", 140, lambda period: range(192))
+    options = ["--calibration", str(known), "--calibrate-seconds", "5"]
+    (line,) = warnings_of(config, tmp_path, log, options, capsys)
+    assert line.startswith(f"warning: {log}: its first seconds, of which the zero is taken, are 60")
+
+
+@pytest.mark.parametrize(("known", "named"), [(40, True), (120, False)])
+def test_curves_of_a_skin_in_which_other_pads_work_are_named(
+    known: int, named: bool, config: Path, tmp_path: Path
+) -> None:
+    settings, layout = load_skin(config)
+    log = write_log(tmp_path / "a.log", 140, untouched)
+    n = layout.n_taxels
+    verdict = np.full(n, CurveVerdict.UNKNOWN, np.uint8)
+    verdict[:known] = CurveVerdict.GOOD
+    kpa = np.tile(8.0 * KNOTS_UNITS, (n, 1))
+    curves = Curves(kpa, np.full(n, 40.0), np.zeros(n), np.zeros(n), verdict, 300.0, 0.0)
+    found = with_curves(calibrate_from_log(log, settings, layout, 5.0), curves)
+    lines = doubts(found, settings, layout)
+    begins = "152 of 192 usable taxels of arm have no curve of their own"
+    assert [line.startswith(begins) for line in lines] == [True] * named
+    with_gain = replace(found, gain=np.full(n, 5.0))
+    assert doubts(with_gain, settings, layout) == []

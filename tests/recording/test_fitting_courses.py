@@ -52,6 +52,25 @@ def test_a_recording_that_is_pressed_while_its_zero_is_taken_is_refused(
     assert "are at 6 to 15 kPa; wanted untouched skin then" in capsys.readouterr().err
 
 
+def test_a_chamber_that_rests_at_some_kpa_is_named_by_its_unit_and_not_as_a_press(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """6 kPa of rest are 60 mbar."""
+    units, table = ramp(bench)
+    kpa = np.loadtxt(table, delimiter=",")[:, 1]
+    log = write_log(bench.with_name("air.log"), units)
+    assert calibrate(bench, log, table_of(bench, 10.0 * (kpa + 6.0))) == 2
+    assert "are they in mbar" in capsys.readouterr().err
+
+
+def test_absolute_pressures_are_named(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    units, table = ramp(bench)
+    kpa = np.loadtxt(table, delimiter=",")[:, 1]
+    log = write_log(bench.with_name("air.log"), units)
+    assert calibrate(bench, log, table_of(bench, kpa + 101.3)) == 2
+    assert "no pressure is below 101 kPa: are they absolute" in capsys.readouterr().err
+
+
 def test_a_chamber_that_rests_at_some_kpa_is_untouched(bench: Path) -> None:
     units, table = ramp(bench)
     kpa = np.loadtxt(table, delimiter=",")[:, 1]

@@ -117,7 +117,7 @@ def test_the_player_has_a_name_at_the_broker_that_no_daemon_has(
     written: Recorded, mosquitto: Mosquitto
 ) -> None:
     assert written.replay(url_of(mosquitto)) == 0
-    assert "skin-demo-main" not in mosquitto.log
+    assert "skin/demo/main" not in mosquitto.log
     assert "skin-playback-" in mosquitto.log
 
 

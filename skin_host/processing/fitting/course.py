@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.errors import RequestError
+from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.curves import (
     KNOTS_UNITS,
     Curve,
@@ -62,10 +63,10 @@ LAG_STEP_S = 0.05
 LEAST_KPA = 10.0
 #: Possible time shift of the pressure against the pads while it moves.
 DOUBT_S = 0.7
-#: A pad jumps if it changes by this much, and this multiple of its noise, within half a second
-#: beyond twice what the pressure explains.
+#: A pad jumps if it changes by this much, and this multiple of what noise leaves in the means of
+#: blocks, within half a second beyond twice what the pressure explains. An hour has 14400 blocks.
 JUMP_UNITS = 8.0
-JUMP_DEVIATIONS = 3.0
+JUMP_DEVIATIONS = 5.5
 #: A pad that spends more than this share of its time at 0 saturates; or at 255, where none is
 #: pressed.
 PRESSED_RAIL_SHARE = 0.005
@@ -353,7 +354,10 @@ def _jumps(units: Floats, pressure: Floats, noise: Floats, dt_s: float) -> Mask:
     moved = windows.max(axis=1) - windows.min(axis=1)
     per_kpa = (np.quantile(blocks, 0.98, axis=0) - np.quantile(blocks, 0.02, axis=0)) / np.ptp(mean)
     beyond = change - 2.0 * moved[:, np.newaxis] * per_kpa
-    jumps: Mask = np.any(beyond > np.maximum(JUMP_UNITS, JUMP_DEVIATIONS * noise), axis=0)
+    # Boards that send faster than their chips convert repeat their readings.
+    conversions = min(length, max(length * dt_s / CONVERSION_S, 1.0))
+    by_noise = noise * np.sqrt(2.0 / conversions)
+    jumps: Mask = np.any(beyond > np.maximum(JUMP_UNITS, JUMP_DEVIATIONS * by_noise), axis=0)
     return jumps
 
 

@@ -30,6 +30,38 @@ __all__ = ["HealthLine", "PartSeries", "Series", "export", "read_frames", "read_
 #: With this a table of a part's frames begins.
 _HEAD = b"seq,t_ns,taxel_0_kpa"
 SUFFIXES = ("", ".npz", ".parquet", ".mcap", ".rrd")
+#: What formats need, as `errors.required` has it.
+_PACKAGES = {
+    "": (),
+    ".npz": (),
+    ".parquet": (("pyarrow", "Parquet tables", "parquet"),),
+    ".mcap": (
+        ("mcap_protobuf", "scenes for Foxglove", "foxglove"),
+        ("foxglove_schemas_protobuf", "scenes for Foxglove", "foxglove"),
+    ),
+    ".rrd": (("rerun", "recordings for Rerun", "rerun"),),
+    "lerobot": (("pyarrow", "data sets of LeRobot", "parquet"),),
+}
+
+
+def check_format(output: Path, *, lerobot: bool = False) -> None:
+    """Check, without a recording, that its format can be written.
+
+    Raises:
+        RequestError: the suffix is another than those of `SUFFIXES`, or a data set of LeRobot has
+            one.
+        SkinError: the package for it is not installed.
+    """
+    if output.suffix not in SUFFIXES:
+        raise RequestError(
+            f"{output}: wanted a name that ends in one of {', '.join(SUFFIXES[1:])}, or a folder"
+        )
+    if lerobot and output.suffix:
+        raise RequestError(
+            f"{output}: a data set of LeRobot is a folder; wanted a name without end"
+        )
+    for package in _PACKAGES["lerobot" if lerobot else output.suffix]:
+        required(*package)
 
 
 def export(
@@ -55,14 +87,7 @@ def export(
             to write is `recording`, or the folder has a part of another one.
         SkinError: it cannot be written, or the package for it is not installed.
     """
-    if output.suffix not in SUFFIXES:
-        raise RequestError(
-            f"{output}: wanted a name that ends in one of {', '.join(SUFFIXES[1:])}, or a folder"
-        )
-    if lerobot and output.suffix:
-        raise RequestError(
-            f"{output}: a data set of LeRobot is a folder; wanted a name without end"
-        )
+    check_format(output, lerobot=lerobot)
     if lerobot:
         from skin_host.recording.export.lerobot import write_lerobot
 

@@ -89,6 +89,23 @@ def test_curves_of_another_shape_than_the_papers_and_hysteresis_carry_over(press
     assert np.median(rms) < 10.0
 
 
+@pytest.mark.parametrize("dt_s", [0.0204, 0.05, 0.061, 0.102, 0.2])
+def test_noise_is_no_jump_and_a_jump_is_one_however_seldom_boards_send(dt_s):
+    """At 0.1 s and more, every third of the noisy pads of a real insole was refused for it."""
+    t = np.arange(0.0, 600.0, dt_s)
+    pressure = np.interp(t, [0.0, 10.0, 300.0, 590.0], [0.0, 0.0, 300.0, 0.0])
+    rng = np.random.default_rng(3)
+    noise = np.repeat([0.8, 2.2, 3.5], 8)
+    converted = (t / 0.0369).astype(np.intp)
+    scattered = (noise * rng.normal(0.0, 1.0, (converted[-1] + 1, 24)))[converted]
+    units = pressure[:, np.newaxis] / 8.0 + scattered
+    units[(t > 200.0) & (t < 230.0), ::8] += 45.0
+    course = replace(as_course(units, pressure), dt_s=dt_s)
+    verdict = fit_course(course, 0.5, Memory()).verdict
+    assert (verdict[::8] == CurveVerdict.JUMPS).all()
+    assert np.count_nonzero(verdict == CurveVerdict.JUMPS) == 3
+
+
 def swept(period_s, top_kpa=100.0):
     """At rest, then up and down at a constant rate [t]."""
     t = np.arange(0.0, 8.0 * period_s + 60.0, DT_S)

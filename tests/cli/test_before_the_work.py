@@ -1,0 +1,120 @@
+"""What cannot be written at the end is refused before the work, which may take minutes."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from skin_host.cli import main
+from skin_host.errors import RequestError, SkinError
+from skin_host.files import check_output
+
+ROOT = Path(__file__).parents[2]
+DEMO = str(ROOT / "config/demo.toml")
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> str:
+    """A recording whose damage is found by whoever reads it."""
+    path = tmp_path / "a.log"
+    path.write_text("damage\n")
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("command", "output", "why"),
+    [
+        (["export", "LOG", "OUTPUT", "--config", DEMO], "a.docx", "wanted a name that ends in"),
+        (["export", "LOG", "OUTPUT", "--config", DEMO], "folder.npz", "it is a folder"),
+        (["export", "LOG", "OUTPUT", "--config", DEMO], "file", "is a file; wanted a folder"),
+        (["export", "LOG", "OUTPUT", "--config", DEMO], "file/a.npz", "Not a directory"),
+        (
+            ["export", "LOG", "OUTPUT", "--lerobot", "--config", DEMO],
+            "a.npz",
+            "a data set of LeRobot is a folder",
+        ),
+        (["plot", "pressure", "LOG", "OUTPUT", "--config", DEMO], "a.docx", "wanted a name that"),
+        (["plot", "map", "LOG", "OUTPUT", "--config", DEMO], "folder.png", "it is a folder"),
+        (["replay", "LOG", "--config", DEMO, "--output", "OUTPUT"], "folder", "it is a folder"),
+        (["report", "--quick", "--output", "OUTPUT"], "file", "is a file; wanted a folder"),
+        (["report", "--rig", "--output", "OUTPUT"], "file/a", "Not a directory"),
+        (["calibrate", DEMO, "--output", "OUTPUT"], "folder", "it is a folder"),
+        (
+            ["calibrate", DEMO, "--relaxation", "LOG", "--output", "OUTPUT"],
+            "folder",
+            "it is a folder",
+        ),
+        (["emulate", DEMO, "--interface", "virtual", "--state", "OUTPUT"], "folder", "a folder"),
+    ],
+)
+def test_a_wrong_output_is_refused_before_anything_is_read(
+    command: list[str],
+    output: str,
+    why: str,
+    log: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for folder in ("folder", "folder.npz", "folder.png"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "file").write_text("kept")
+    named = {"LOG": log, "OUTPUT": str(tmp_path / output)}
+
+    status = main([named.get(word, word) for word in command])
+
+    told = capsys.readouterr()
+    line = told.err.splitlines()[-1]
+    assert f"{tmp_path / output}: " in line
+    assert why in line
+    assert status == (1 if why == "Not a directory" else 2)
+    assert "damage" not in told.err
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+@pytest.mark.parametrize(
+    ("command", "package"),
+    [
+        (["export", "LOG", "a.parquet", "--config", DEMO], "pyarrow"),
+        (["export", "LOG", "a", "--lerobot", "--config", DEMO], "pyarrow"),
+        (["export", "LOG", "a.rrd", "--config", DEMO], "rerun"),
+        (["export", "LOG", "a.mcap", "--config", DEMO], "mcap_protobuf"),
+        (["plot", "pressure", "LOG", "a.png", "--config", DEMO], "matplotlib"),
+    ],
+)
+def test_a_package_that_is_not_installed_is_asked_for_before_anything_is_read(
+    command: list[str],
+    package: str,
+    log: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    assert main([log if word == "LOG" else word for word in command]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"need the package {package}, which is not installed; mend it with: pip" in line
+
+
+def test_what_can_be_written_is_not_touched_by_the_check(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("kept")
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere" / "file")
+    before = sorted(tmp_path.iterdir())
+    for name in ("file", "new", "a/b/new", "link"):
+        check_output(tmp_path / name)
+    for name in (".", "new", "a/b/new"):
+        check_output(tmp_path / name, folder=True)
+    check_output(Path("/dev/stdout"))
+    check_output(Path("/dev/null"))
+    assert sorted(tmp_path.iterdir()) == before
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_a_place_where_nothing_can_be_written_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "folder").mkdir()
+    monkeypatch.setattr("os.access", lambda path, _: Path(path) != tmp_path)
+    for folder in (False, True):
+        with pytest.raises(SkinError, match="new: cannot be written: Permission denied") as refused:
+            check_output(tmp_path / "new", folder=folder)
+        assert not isinstance(refused.value, RequestError)
+        check_output(tmp_path / "folder" / "new", folder=folder)
