@@ -24,6 +24,7 @@ export function calibrated(answers, part) {
   if (wrong.length) return { text: wrong.join(" "), level: errors.length ? "alarm" : "warn", ms: 15000 };
   // The verdicts are of all parts; those of another calibration are not news.
   const verdicts = results.flatMap((result) => Object.entries(result.verdicts)).filter(([name]) => !part || name === part);
+  verdicts.sort(([one], [other]) => (one < other ? -1 : 1)); // whichever node was the first to answer
   const counts = verdicts.map(([name, found]) => `${name}: ${Object.entries(found).map(([verdict, n]) => `${n} ${verdict.replaceAll("_", " ")}`).join(", ")}`);
   return { text: `Calibrated. ${counts.length > 3 ? `${counts.length} parts` : counts.join("; ")}`, level: "ok", ms: 6000 };
 }

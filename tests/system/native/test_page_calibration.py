@@ -142,4 +142,4 @@ async def test_a_node_that_is_well_does_not_hide_what_another_one_found(
         await shows(seen, "a bus is down")
         robot.answers = {"main": WELL, "arm": arm}
         await calibrate(seen)
-        await shows(seen, "Calibrated. left_hand: 104 ok; left_forearm: 96 ok")
+        await shows(seen, "Calibrated. left_forearm: 96 ok; left_hand: 104 ok")
