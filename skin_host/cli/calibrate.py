@@ -26,7 +26,7 @@ from skin_host.cli.common import (
 )
 from skin_host.cli.options import add_rules
 from skin_host.config.relaxation import FITTED
-from skin_host.errors import OtherSkinError, RequestError, visible
+from skin_host.errors import RequestError, visible
 from skin_host.files import check_output
 
 if TYPE_CHECKING:
@@ -165,10 +165,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
             "calibrating beside it "
             "would zero its boards; ask it with `skin command calibrate`, or stop it"
         )
-    try:
-        zeros = remembered(settings, layout, arguments.node).zeros
-    except OtherSkinError:
-        zeros = remembered(settings, layout, arguments.node, take_new=True).zeros
+    zeros = remembered(settings, layout, arguments.node, take_new=True).zeros
     progress = Progress("calibrating, keep the skin untouched")
     touched = zeros.touched
     try:

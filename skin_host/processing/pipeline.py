@@ -253,8 +253,7 @@ class _Rules(NamedTuple):
         curve: Curve = common
         if curves is not None:
             parts = [slice(part.start, part.stop) for part in layout.parts]
-            ungained = (calibration.gain == 1.0) & (calibration.bend == 1.0)
-            curve = with_own(common, curves, parts, ungained)
+            curve = with_own(common, curves, parts, ~calibration.gained)
         above = calibration.percentile - calibration.baseline
         spread = calibration.spread
         if curves is not None:

@@ -344,10 +344,9 @@ def _foreign_curves(calibration: Calibration, layout: Layout) -> list[str]:
     if calibration.curves is None:
         return []
     own = calibration.curves.own
-    gained = (calibration.gain != 1.0) | (calibration.bend != 1.0)
     found = []
     for name, used in _used_in_both(calibration, calibration, layout):
-        without, of = np.count_nonzero(used & ~own & ~gained), np.count_nonzero(used)
+        without, of = np.count_nonzero(used & ~own & ~calibration.gained), np.count_nonzero(used)
         if (used & own).any() and 2 * without > of:
             found.append(
                 f"{without} of {of} usable taxels of {name} have no curve of their own, as their "

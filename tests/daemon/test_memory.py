@@ -36,6 +36,9 @@ from tests.support.stepped import stepped
 
 PARTS = ("a", "b", "c")
 TIP = "tip4-1"
+#: What `known_of_all` keeps of each part, and of all.
+KEPT = {part: [number] for number, part in enumerate(PARTS)}
+THRESHOLDS = Thresholds(margin_units=5.0)
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 
 
@@ -138,21 +141,25 @@ def shares(n: int) -> range:
     return range(1, n + 1)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
-def test_a_share_takes_over_all_that_the_whole_node_knows(skin: Skin, n: int) -> None:
+def known_of_all(skin: Skin, written_s: float, disabled: str = "a") -> Calibration:
+    """Let `main` have had all parts, each with something that is known of its zeros."""
     calibration = skin.calibration(3.0, 0)
-    kept = {part: [number] for number, part in enumerate(PARTS)}
     zeros = Zeros(
         calibration=calibration.id,
-        unknown=kept,
-        stuck=kept,
-        touched=kept,
+        unknown=KEPT,
+        stuck=KEPT,
+        touched=KEPT,
         baselines=skin.baselines(4.0, *PARTS),
         parts=[*PARTS, TIP],
-        written=after(10),
+        written=after(written_s),
     )
-    thresholds = Thresholds(margin_units=5.0)
-    skin.keep("main", calibration, zeros, NodeState(disabled=["b"], thresholds=thresholds))
+    skin.keep("main", calibration, zeros, NodeState(disabled=[disabled], thresholds=THRESHOLDS))
+    return calibration
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_a_share_takes_over_all_that_the_whole_node_knows(skin: Skin, n: int) -> None:
+    calibration = known_of_all(skin, 10, disabled="b")
     seen = set()
     for number in shares(n):
         memory = skin.start(number, n)
@@ -162,10 +169,10 @@ def test_a_share_takes_over_all_that_the_whole_node_knows(skin: Skin, n: int) ->
         mine = [part for part in PARTS if part in (memory.zeros.parts or [])]
         seen.update(mine)
         for found in (memory.zeros.unknown, memory.zeros.stuck, memory.zeros.touched):
-            assert found == {part: kept[part] for part in mine}
+            assert found == {part: KEPT[part] for part in mine}
         assert memory.zeros.baselines == skin.baselines(4.0, *mine)
         assert memory.state.disabled == ["b"] * ("b" in mine)
-        assert memory.state.thresholds == thresholds
+        assert memory.state.thresholds == THRESHOLDS
     assert seen == set(PARTS)
 
 
@@ -213,24 +220,6 @@ class Moved:
 
     def start(self, node: str) -> NodeMemory:
         return remembered(self.settings, self.layout, node)
-
-
-def known_of_all(skin: Skin, written_s: float) -> Calibration:
-    """Let `main` have had all parts, each with something that is known of its zeros."""
-    calibration = skin.calibration(3.0, 0)
-    kept = {part: [number] for number, part in enumerate(PARTS)}
-    zeros = Zeros(
-        calibration=calibration.id,
-        unknown=kept,
-        stuck=kept,
-        touched=kept,
-        baselines=skin.baselines(4.0, *PARTS),
-        parts=[*PARTS, TIP],
-        written=after(written_s),
-    )
-    thresholds = Thresholds(margin_units=5.0)
-    skin.keep("main", calibration, zeros, NodeState(disabled=["a"], thresholds=thresholds))
-    return calibration
 
 
 def test_a_node_knows_what_the_node_that_had_its_part_before_has_kept(skin: Skin) -> None:

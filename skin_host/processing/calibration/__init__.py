@@ -105,6 +105,12 @@ class Calibration:
         usable.flags.writeable = False
         return usable
 
+    @property
+    def gained(self) -> NDArray[np.bool_]:
+        """Which taxels [n] a recording under pressure has given a gain or a bend of their own."""
+        gained: NDArray[np.bool_] = (self.gain != 1.0) | (self.bend != 1.0)
+        return gained
+
 
 def with_gains(calibration: Calibration, gain: Floats, bend: Floats) -> Calibration:
     """Return the calibration with gains and bends [n] fitted to known pressures."""
