@@ -510,6 +510,12 @@ class Cable:
         self._command(self.name, can_id, data)
         return True
 
+    def send_as_other_host(self, can_id: int, data: bytes) -> None:
+        """A frame of another program on the bus, which the daemon receives as the boards do."""
+        now_ns = self._clock.monotonic_ns()
+        if self.send(can_id, data):
+            self.arrive(FrameBatch.of([(can_id, data, now_ns)]))
+
 
 class SimulatedPort(Port):
     """The daemon's end of a cable."""

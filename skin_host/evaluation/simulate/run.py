@@ -26,7 +26,7 @@ from skin_host.evaluation.simulate.promises.limits import SAMPLE_S
 from skin_host.evaluation.simulate.trace import Before
 from skin_host.evaluation.simulate.troubles import (
     ACTS,
-    LASTING,
+    APART,
     WIRING,
     Trouble,
     act,
@@ -223,7 +223,7 @@ class _Run:
     ) -> None:
         self.world = world
         self._kinds = kinds_of(world.settings)
-        self.result = RunResult(seed, kinds=sorted(self._kinds | LASTING))
+        self.result = RunResult(seed, kinds=sorted(self._kinds | APART))
         self._state = state
         self._seconds = seconds
         self._until_s = until_s
@@ -391,7 +391,7 @@ class _Run:
         """Begin a trouble; None if another one has unplugged the chip that was drawn."""
         world = self.world
         try:
-            trouble = (self._kinds | LASTING)[name](world, chance, plain)
+            trouble = (self._kinds | APART)[name](world, chance, plain)
         except ConfigurationError:
             return None
         world.note(f"trouble: {trouble.about}")
@@ -547,6 +547,7 @@ class _Run:
             self._set_up_in_a_press,
             self._lose_broker_in_presses,
             self._fail_after_writing,
+            self._obey_another_host_in_a_press,
         )
         situation = situations[(self.result.seed + self._rehearsals) % len(situations)]
         self._rehearsals += 1
@@ -604,6 +605,14 @@ class _Run:
         await clock.sleep(self._staging.uniform(0.1, 2.0))
         self._start()
         await clock.sleep(5.0)
+
+    async def _obey_another_host_in_a_press(self) -> None:
+        """Another program on the bus sets a board up while it is pressed."""
+        pressing = asyncio.create_task(self._press_all(8.0), name="press all")
+        await self.world.clock.sleep(self._staging.uniform(1.0, 2.0))
+        self._inject("other_host", self._staging)
+        await pressing
+        await self.world.clock.sleep(BACK_NS / 1e9)
 
     # ------------------------------------------------------------------ light loss
 

@@ -6,13 +6,21 @@ A trouble has the codes that health may report for it, and the one that it must 
 import math
 import random
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator import faults
 from emulator.probes.scene import Fault
+from skin_host.bus.board import configuration
+from skin_host.bus.commands import (
+    SetBoardConfig,
+    SetTriangleConfig,
+    SetTxMode,
+    TxMode,
+    command_frame,
+)
 from skin_host.bus.port import LinkState
 from skin_host.config.settings import Settings
 from skin_host.evaluation.simulate.cables import Mischief
@@ -106,6 +114,8 @@ RECOVERS_S = 5.0
 RESTS_AGAIN_S = 20.0
 #: A broker ends the connection of a client from which nothing came for longer.
 KEEP_ALIVE_S = 10.0
+#: Pauses between the commands of another host: an MTB3 misses what comes while it zeroes itself.
+OTHER_HOST_S = (0.005, 0.05, 0.2)
 #: While it lasts, the chip that it names does not measure.
 SILENCING = {"chip_gone"}
 #: A pad may have moved less than most, so it may repeat itself so often before it is surely stuck.
@@ -505,6 +515,35 @@ def _light_loss(world: World, chance: random.Random, _: bool) -> Trouble:
     )
 
 
+def _other_host(world: World, chance: random.Random, _: bool) -> Trouble:
+    """Another program on the bus sets a board up: as the daemon does, or with another unit or
+    period.
+    """
+    number = chance.randrange(len(world.layout.boards))
+    board = world.layout.boards[number]
+    mine = [triangle for triangle in world.layout.triangles if triangle.board == number]
+    commands = [*configuration(board, mine), SetTxMode(TxMode.START)]
+    otherwise = chance.choice(("", "shift", "period"))
+    for at, command in enumerate(commands):
+        if otherwise == "shift" and isinstance(command, SetTriangleConfig):
+            commands[at] = replace(command, shift=command.shift - 1 if command.shift else 1)
+        elif otherwise == "period" and isinstance(command, SetBoardConfig):
+            commands[at] = replace(command, period_ms=2 * command.period_ms)
+    pause_s = chance.choice(OTHER_HOST_S)
+    cable = world.cables[board.settings.bus]
+    for at, command in enumerate(commands):
+        frame = command_frame(command, board.settings.address)
+        world.clock.call_later(at * pause_s, cable.send_as_other_host, *frame)
+    return Trouble(
+        "other_host",
+        f"other_host board={board.name} otherwise={otherwise or 'no'}",
+        _nothing,
+        _SET_UP | _CHIPS | _TIMING | {"bus_silent"},
+        places=places_of(world, board=board.name),
+        lasts_s=(0.0, 0.0),
+    )
+
+
 def _address_twice(world: World, chance: random.Random, _: bool) -> Trouble:
     """A second board of the same address sends the same bus full of its own sweeps."""
     board = chance.choice(world.layout.boards)
@@ -879,8 +918,9 @@ KINDS: dict[str, Begin] = {
     "disk_read_only": _disk("disk_read_only", READ_ONLY),
     "disk_slow": _disk_slow,
 }
-#: What lasts for longer than a storm has a time of its own, so storms and drills draw none of it.
-LASTING: dict[str, Begin] = {"light_loss": _light_loss}
+#: Storms and drills draw none of these: what lasts for longer than a storm has a time of its own,
+#: and another host comes in a rehearsal.
+APART: dict[str, Begin] = {"light_loss": _light_loss, "other_host": _other_host}
 #: Those of robots with fingertips alone: what other robots draw does not depend on them.
 OF_FINGERTIPS: dict[str, Begin] = {"board_latched": _board_latched}
 

@@ -17,7 +17,7 @@ from skin_host.config.settings import TouchSettings
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.promises.contacts import least_mean
 from skin_host.evaluation.simulate.run import simulate
-from skin_host.evaluation.simulate.troubles import LASTING, kinds_of
+from skin_host.evaluation.simulate.troubles import APART, kinds_of
 from skin_host.fingertip.events import Over, Slip
 from skin_host.fingertip.tip import Tip
 from skin_host.processing import pipeline, touch
@@ -247,15 +247,16 @@ def test_a_contact_without_weight_may_be_anywhere_among_its_pads() -> None:
 
 
 @pytest.mark.long
-def test_light_loss_lasts_for_minutes_is_named_and_breaks_no_promise() -> None:
+def test_light_loss_and_another_host_break_no_promise() -> None:
+    """The loss lasts for minutes and is named."""
     settings, layout = load_skin(SMALL)
     result = simulate(settings, layout, SMALL, 4, 30.0)
     assert result.broken is None, "\n".join([*result.last, result.broken])
-    assert "light_loss" in result.kinds
-    assert result.troubles["light_loss"] == 1
+    assert APART.keys() <= set(result.kinds)
+    assert {result.troubles[name] for name in APART} == {1}
     assert "light_loss" in result.named
 
 
-def test_what_storms_and_drills_draw_does_not_depend_on_what_lasts_for_minutes() -> None:
+def test_storms_and_drills_draw_nothing_that_has_a_time_of_its_own() -> None:
     settings, _ = load_skin(SMALL)
-    assert not LASTING.keys() & kinds_of(settings).keys()
+    assert not APART.keys() & kinds_of(settings).keys()
