@@ -548,6 +548,7 @@ class _Run:
             self._lose_broker_in_presses,
             self._fail_after_writing,
             self._obey_another_host_in_a_press,
+            self._lose_all_power_in_a_press,
         )
         situation = situations[(self.result.seed + self._rehearsals) % len(situations)]
         self._rehearsals += 1
@@ -613,6 +614,37 @@ class _Run:
         self._inject("other_host", self._staging)
         await pressing
         await self.world.clock.sleep(BACK_NS / 1e9)
+
+    async def _lose_all_power_in_a_press(self) -> None:
+        """The power of robot and computer fails together, as when a battery is changed. What was
+        pressed before and still is does not read as untouched afterwards.
+        """
+        clock = self.world.clock
+        pressing = asyncio.create_task(self._press_all(16.0), name="press all")
+        await clock.sleep(self._staging.uniform(5.0, 7.0))
+        held = self._parts_with_contact(b"ON")
+        self.result.deaths += 1
+        self._kill(power=True)
+        for board in self.world.layout.boards:
+            self._promises.begin(act("power"))
+            self.world.robot.inject(Fault(name="board_reset", board=board.name))
+        await clock.sleep(self._staging.uniform(0.1, 2.0))
+        self._start()
+        while any(spot.pressed for spot in self.world.spots):
+            for part in held & self._parts_with_contact(b"OFF"):
+                self._promises.break_(f"{part}: OFF after a power failure, and still pressed")
+            await clock.sleep(0.1)
+        await pressing
+        await clock.sleep(BACK_NS / 1e9)
+
+    def _parts_with_contact(self, state: bytes) -> set[str]:
+        """Return the parts with skin of which the broker keeps this contact."""
+        life = self.world.life
+        if life is None:
+            return set()
+        topics, retained = life.daemon.publisher.topics, self.world.broker.retained
+        parts = (part.name for part in self.world.layout.parts)
+        return {name for name in parts if retained.get(topics.part("contact", name)) == state}
 
     # ------------------------------------------------------------------ light loss
 

@@ -781,9 +781,7 @@ ACTS: dict[str, set[str]] = {
     "power": _SET_UP | _CHIPS | _TIMING | {"bus_silent"},
     "enable": set(),
     "thresholds": set(),
-    "reload": _ZEROED
-    | _TIPS
-    | {"bus_silent", "board_silent", "triangle_missing", "bus_loses_frames"},
+    "reload": set(),
 }
 
 _LINE = {"line_shorted", "triangle_no_ack", "triangle_not_connected"}
