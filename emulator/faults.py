@@ -3,7 +3,7 @@
 `begin` starts a fault on a robot and returns the function that ends it.
 """
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, Protocol
@@ -25,8 +25,8 @@ from skin_host.config.explain import explain, out_of_bounds
 from skin_host.errors import ConfigurationError, nearest
 from skin_host.layout import TAXELS_PER_TRIANGLE
 
-#: Ends a fault. Made of parts that a saved state can hold, see `emulator.state`.
-Mend = Callable[[], object]
+#: What a fault does something to.
+Thing = tuple[Hashable, ...]
 #: Takes the own value of a thing, and what faults put in its place, the newest last.
 Put = Callable[[Any, tuple[Any, ...]], object]
 
@@ -39,24 +39,29 @@ class Active:
     """
 
     def __init__(self) -> None:
-        self._of: dict[tuple[Hashable, ...], tuple[Any, dict[int, Any]]] = {}
+        self._of: dict[Thing, tuple[Any, dict[int, Any]]] = {}
         self._begun = 0
 
-    def begin(self, thing: tuple[Hashable, ...], own: Any, value: Any, put: Put) -> Mend:
+    def begin(self, thing: Thing, own: Any, value: Any, put: Put) -> "Mend":
         """Do something to a thing that has the value `own` without faults."""
         self._begun += 1
         own, values = self._of.setdefault(thing, (own, {}))
         values[self._begun] = value
         put(own, tuple(values.values()))
-        return partial(self._end, thing, self._begun, put)
+        return Mend(self, ((thing, self._begun, put),))
 
-    def end_all(self, thing: tuple[Hashable, ...], put: Put) -> None:
+    def has(self, thing: Thing, number: int) -> bool:
+        """Whether what was begun with this number is still done to a thing."""
+        return number in self._of.get(thing, (None, ()))[1]
+
+    def end_all(self, thing: Thing, put: Put) -> None:
         """End all that is done to a thing."""
         own, values = self._of.pop(thing, (None, {}))
         if values:
             put(own, ())
 
-    def _end(self, thing: tuple[Hashable, ...], number: int, put: Put) -> None:
+    def end(self, thing: Thing, number: int, put: Put) -> None:
+        """End what was begun with this number."""
         own, values = self._of.get(thing, (None, {}))
         if number not in values:
             return  # it has ended
@@ -64,6 +69,34 @@ class Active:
         if not values:
             del self._of[thing]
         put(own, tuple(values.values()))
+
+
+@dataclass(frozen=True, slots=True)
+class Mend:
+    """Ends a fault. Made of parts that a saved state can hold, see `emulator.state`.
+
+    Attributes:
+        active: where it is kept what faults do.
+        begun: what the fault does, each with its number and with what puts it back; nothing if it
+            cannot be undone.
+    """
+
+    active: Active
+    begun: tuple[tuple[Thing, int, Put], ...] = ()
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the fault still does something that can be ended."""
+        return any(self.active.has(thing, number) for thing, number, _ in self.begun)
+
+    def __call__(self) -> None:
+        for thing, number, put in self.begun:
+            self.active.end(thing, number, put)
+
+
+def _together(mends: Iterable[Mend], robot: "FaultyRobot") -> Mend:
+    """One that ends all of them."""
+    return Mend(robot.active, tuple(begun for mend in mends for begun in mend.begun))
 
 
 class FaultyRobot(Protocol):
@@ -128,6 +161,8 @@ def parse(text: str) -> Fault:
         key, equals, value = pair.partition("=")
         if not equals:
             raise ConfigurationError(f'"{pair}": wanted key=value')
+        if key in fields:
+            raise ConfigurationError(f'"{text}": {key} is given twice; wanted it once')
         fields[key] = value
     try:
         fault = msgspec.convert(fields, Fault, strict=False)
@@ -196,6 +231,22 @@ def check_targets(robot: FaultyRobot, fault: Fault) -> None:
         aim(robot, _with_value(fault))
 
 
+def line_of(fault: Fault) -> str:
+    """The line that names a fault, without its times."""
+    keys = ("board", "bus", "triangle", "taxel", "value")
+    given = ((key, getattr(fault, key)) for key in keys)
+    return " ".join([fault.name, *(f"{key}={seen}" for key, seen in given if seen is not None)])
+
+
+def is_same(one: Fault, other: Fault) -> bool:
+    """Whether two faults do the same, at whatever times."""
+    mine, others = (
+        msgspec.structs.replace(_with_value(fault), at_s=0.0, until_s=None)
+        for fault in (one, other)
+    )
+    return mine == others
+
+
 def _with_value(fault: Fault) -> Fault:
     if fault.value is not None:
         return fault
@@ -240,11 +291,6 @@ def _newest(put: Callable[[Any], object], own: Any, values: tuple[Any, ...]) -> 
     put(values[-1] if values else own)
 
 
-def _end_each(mends: tuple[Mend, ...]) -> None:
-    for mend in mends:
-        mend()
-
-
 def _force(robot: FaultyRobot, chip: int, word: int) -> Mend:
     """Let a word be read instead of a chip."""
     return robot.active.begin(("chip", chip), None, word, _forced(robot, chip))
@@ -261,7 +307,7 @@ def _chip_gone(robot: FaultyRobot, fault: Fault) -> Mend:
 def _chip_back(robot: FaultyRobot, fault: Fault) -> Mend:
     chip = _chip(robot, fault)
     robot.active.end_all(("chip", chip), _forced(robot, chip))
-    return _nothing
+    return Mend(robot.active)
 
 
 def _shorted_finger(robot: FaultyRobot, fault: Fault) -> Mend:
@@ -269,7 +315,7 @@ def _shorted_finger(robot: FaultyRobot, fault: Fault) -> Mend:
     chip_of_slot = robot.converters.chip_of_slot[_board(robot, fault)]
     first = CHIPS_PER_LINE * _line(robot, fault)
     own = chip_of_slot[first : first + CHIPS_PER_LINE].tolist()
-    return partial(_end_each, tuple(_force(robot, chip, 0) for chip in own if chip >= 0))
+    return _together((_force(robot, chip, 0) for chip in own if chip >= 0), robot)
 
 
 def _slot(robot: FaultyRobot, fault: Fault) -> int:
@@ -344,7 +390,7 @@ def _shared_address(robot: FaultyRobot, fault: Fault) -> Mend:
     alone = _rewire(robot, number, partial(_unplug, _slot(robot, fault)))
     put = partial(_newest, partial(robot.converters.answer_second, number, other))
     second = robot.active.begin(("second", number, other), None, chip, put)
-    return partial(_end_each, (second, alone))
+    return _together((second, alone), robot)
 
 
 def _stuck_taxel(robot: FaultyRobot, fault: Fault) -> Mend:
@@ -434,7 +480,7 @@ def _slow_rise(robot: FaultyRobot, fault: Fault) -> Mend:
 
 def _brown_out(robot: FaultyRobot, fault: Fault) -> Mend:
     robot.converters.brown_out(_chip(robot, fault))
-    return _nothing
+    return Mend(robot.active)
 
 
 # ---------------------------------------------------------------------- boards and buses
@@ -442,7 +488,7 @@ def _brown_out(robot: FaultyRobot, fault: Fault) -> Mend:
 
 def _board_reset(robot: FaultyRobot, fault: Fault) -> Mend:
     robot.boards[fault.board or ""].reset(robot.t_ns)
-    return _nothing
+    return Mend(robot.active)
 
 
 def _board_silent(robot: FaultyRobot, fault: Fault) -> Mend:
@@ -471,12 +517,12 @@ def _silence_fingertip(robot: FaultyRobot, name: str, _: bool, silent: tuple[boo
 def _board_latched(robot: FaultyRobot, fault: Fault) -> Mend:
     name = fault.board or ""
     latched = robot.fingertips.boards[name].latched
-    return partial(
-        _end_each,
-        tuple(
+    return _together(
+        (
             robot.active.begin(("latched", name, half), False, True, partial(_latch, latched, half))
             for half in _LATCHED[round(fault.value or 0)]
         ),
+        robot,
     )
 
 
@@ -534,10 +580,6 @@ def _babbling_node(robot: FaultyRobot, fault: Fault) -> Mend:
 
 def _babble(robot: FaultyRobot, bus: str, share: float) -> None:
     robot.wires[bus].babble(share, robot.t_ns)
-
-
-def _nothing() -> None:
-    """Do nothing: the fault cannot be undone."""
 
 
 _CHIP = ("board", "triangle")

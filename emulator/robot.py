@@ -33,7 +33,7 @@ from emulator.wire import NOTHING, Wire
 from skin_host.bus.commands import Message, SetTxMode, TxMode, command_frame
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings
-from skin_host.errors import ConfigurationError
+from skin_host.errors import ConfigurationError, RequestError
 from skin_host.files import write_atomic
 from skin_host.layout import Layout
 
@@ -141,6 +141,8 @@ class Robot:
         self._bursts = Bursts(self._boards, self._bus_of, self.converters)
         self._rng = np.random.default_rng([scene.seed, 5])
         self.active = faults.Active()
+        #: Faults that began, and how they end; those that are over stay until another one begins.
+        self._begun: list[tuple[Fault, faults.Mend]] = []
         self.hung: set[int] = set()
         self.late_ns: dict[int, int] = {}
         self.jitter_ns: dict[int, float] = {}
@@ -161,7 +163,12 @@ class Robot:
 
         Returns:
             By bus, the frames whose transmission ended meanwhile, `t_ns` that moment.
+
+        Raises:
+            RequestError: time does not go back, nor for ever.
         """
+        if not 0.0 <= dt_s < math.inf:
+            raise RequestError(f"dt_s: seen {dt_s}, wanted a time of 0 s or more")
         end_ns = self.t_ns + round(dt_s * NS)
         wires = self.wires
         if (
@@ -344,7 +351,8 @@ class Robot:
                 ahead_ns += left_out_ns
                 for board in self._boards:
                     board.start_ns -= left_out_ns
-            passed_ns = now_ns - ahead_ns - self.t_ns
+            # Whole periods that were left out may end a little later than now.
+            passed_ns = max(0, now_ns - ahead_ns - self.t_ns)
             # Commands came one after the other in this time: boards whose computer was busy
             # must not get them all at once, chips convert between them.
             steps = []
@@ -405,6 +413,7 @@ class Robot:
             ConfigurationError: no such fault, or not a thing of this robot.
         """
         mend = faults.begin(self, fault)
+        self._begun = [one for one in self._begun if one[1].is_on] + [(fault, mend)]
         self._look_ahead()
         if fault.until_s is not None:
             self._plan(self.t_ns / NS + fault.until_s - fault.at_s, mend)
@@ -414,6 +423,19 @@ class Robot:
             self._look_ahead()
 
         return end
+
+    @property
+    def faults_on(self) -> list[Fault]:
+        """The faults that are on and can be ended, of the scene too, the newest last."""
+        return [fault for fault, mend in self._begun if mend.is_on]
+
+    def mend(self, fault: Fault) -> bool:
+        """End what is on of the same faults, whenever they would end; whether there were any."""
+        mends = [mend for one, mend in self._begun if mend.is_on and faults.is_same(one, fault)]
+        for mend in mends:
+            mend()
+        self._look_ahead()
+        return bool(mends)
 
     def _happen(self, number: int, fault: Fault) -> None:
         """Let a fault of the scene begin, unless another one has unplugged what it is of."""
@@ -517,7 +539,11 @@ class LiveProbe:
     def press(self, drive: float, x_mm: float = 0.0, y_mm: float = 0.0) -> None:
         """Press from now on with a force (N), or to a depth (mm) if it is driven by depth; on skin
         also off its place. No probe goes deeper than the foam lets it, `foam.MOST_STRAIN`.
+
+        Raises:
+            RequestError: one of them is no finite number.
         """
+        _refuse_infinite(drive=drive, x_mm=x_mm, y_mm=y_mm)
         if self._number is None:
             self._drive_n = drive
             return
@@ -527,7 +553,11 @@ class LiveProbe:
     def pull(self, force_n: float) -> None:
         """Pull an object that hangs on it along the surface from now on, until it is lifted; only a
         force/torque board feels that.
+
+        Raises:
+            RequestError: it is no finite number.
         """
+        _refuse_infinite(force_n=force_n)
         self._pull_n = force_n
 
     def lift(self) -> None:
@@ -549,6 +579,13 @@ class LiveProbe:
     def pulling_n(self) -> float | None:
         """Return the pull; None if nothing hangs on it."""
         return self._pull_n
+
+
+def _refuse_infinite(**numbers: float) -> None:
+    """Refuse what would press nothing, or everything, without a word."""
+    for name, seen in numbers.items():
+        if not math.isfinite(seen):
+            raise RequestError(f"{name}: seen {seen}, wanted a finite number")
 
 
 class _StackSizes:

@@ -17,7 +17,7 @@ import msgspec
 from skin_host.errors import RequestError
 from skin_host.files import read_whole
 
-MAGIC = b"skin-emulator-state/8\n"
+MAGIC = b"skin-emulator-state/9\n"
 DIGEST_BYTES = 32
 #: More than a robot of 100 000 taxels needs.
 MOST_BYTES = 2_000_000_000
@@ -47,12 +47,10 @@ _FUNCTIONS = {
     ("emulator.faults", name)
     for name in (
         "_babble",
-        "_end_each",
         "_hold",
         "_latch",
         "_move",
         "_newest",
-        "_nothing",
         "_put",
         "_rewired",
         "_set_noise",
@@ -92,7 +90,6 @@ _METHODS = {
     ("emulator.chips.i2c_wire", "DataLine", "refuse"),
     ("emulator.chips.i2c_wire", "DataLine", "rise_slowly"),
     ("emulator.chips.i2c_wire", "DataLine", "stretch"),
-    ("emulator.faults", "Active", "_end"),
     ("emulator.probes.coverage", "Coverage", "_inside"),
     ("emulator.robot", "LiveProbe", "pressing_n"),
     ("emulator.robot", "LiveProbe", "pulling_n"),

@@ -355,14 +355,19 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
     except Exception as error:
         # Each adapter's library has its own errors; the user gets one kind.
         why = one_line(error)
+        # What is not installed does not come by waiting.
+        absent = ""
         if settings.interface == MULTICAST and find_spec("msgpack") is None:
-            why = "the package msgpack is not installed; mend it with: "
-            why += "pip install 'skin-host[multicast]'"
+            why, absent = "the package msgpack is not installed", "skin-host[multicast]"
         elif isinstance(error, can.CanInterfaceNotImplementedError | ImportError):
             extra = _EXTRAS.get(settings.interface)
-            why += f"; mend it with: pip install 'python-can[{extra}]'" if extra else ""
+            absent = f"python-can[{extra}]" if extra else ""
         elif isinstance(error, TypeError):  # of its arguments, which are these
             why += f"; python-can's {settings.interface} takes them from [buses.{name}.options]"
+        if absent:
+            raise ConfigurationError(
+                f"{where}: cannot be opened: {why}; mend it with: pip install '{absent}'"
+            ) from None
         raise BusError(f"{where}: cannot be opened: {why}") from None
     return bus
 

@@ -123,7 +123,8 @@ class AssemblerCounters:
     """Counts all frames that did not become part of a sweep, and everything that was missing."""
 
     frames: int = 0
-    #: Frames outside the skin stream: answers, other sensors, unconfigured nodes.
+    #: Frames outside the skin stream, as answers, other sensors and unconfigured nodes, and skin
+    #: frames of boards that others read.
     other: int = 0
     #: Of the configured force/torque boards.
     force_torque: int = 0
@@ -279,6 +280,7 @@ class Assembler:
         boards: (index in `Layout.boards`, board) of the boards on this bus.
         close_periods: a sweep is closed when its first frame is this many periods old.
         force_torque: identifiers of the data of the configured force/torque boards.
+        others: addresses of the configured boards of this bus that another node reads.
 
     Attributes:
         stranger_id: the most frequent identifier among motor frames, when these were last more than
@@ -291,11 +293,13 @@ class Assembler:
         boards: list[tuple[int, BoardLayout]],
         close_periods: float,
         force_torque: frozenset[int] = frozenset(),
+        others: frozenset[int] = frozenset(),
     ) -> None:
         self.counters = AssemblerCounters()
         self.stranger_id: int | None = None
         self.unconfigured: Counter[int] = Counter()
         self._force_torque = force_torque
+        self._others = others
         self._states: dict[int, _BoardState] = {}
         # For identifier << 8 | header byte of each frame that a configured triangle may send: the
         # board, the place among its values, and the bit in its masks.
@@ -477,6 +481,8 @@ class Assembler:
         address = identifier >> 4 & 0xF
         if address in self._states:
             self.counters.unknown_triangle += 1
+        elif address in self._others:
+            self.counters.other += 1
         else:
             self.counters.unknown_board += 1
             self.unconfigured[address] += 1

@@ -62,6 +62,10 @@ ALONE_NS = 1_000_000_000
 #: frames are lost. Of one that sends far too often nearly all do.
 APART_SHARE = 0.7
 LEAST_APART_SHARE = 0.4
+#: Whatever a board sends, so many times as many sweeps as it is set up for are processed, and ...
+MOST_OFTEN = 5.0
+#: ... at once as many as it may send in this time: they have waited where a computer was busy.
+MOST_WAITING_NS = 10_000_000_000
 _NO_STATUS = bytes(2 * TRIANGLES)
 
 
@@ -110,6 +114,7 @@ class BoardLedger:
         silences, resets, lost_set_ups, tx_overflows, rezeros: int64[b], how often it timed out,
             restarted by itself, sent something that it was not set up to send, reported that it had
             to drop frames, and was zeroed.
+        excess: int64[b], how many of its sweeps are too many to be processed.
     """
 
     def __init__(
@@ -157,6 +162,12 @@ class BoardLedger:
         self._since_set_up = [0] * n
         self.twice: dict[int, int] = {}
         self._crowds: dict[int, _Crowd] = {}
+        #: Of each board, how many of its sweeps came too soon of late, up to when, and whether the
+        #: last one is too much.
+        self._early = [0.0] * n
+        self._early_ns = [0] * n
+        self._is_excess = [False] * n
+        self.excess = np.zeros(n, np.int64)
         self.silences = np.zeros(n, np.int64)
         self.resets = np.zeros(n, np.int64)
         self.lost_set_ups = np.zeros(n, np.int64)
@@ -196,6 +207,7 @@ class BoardLedger:
             self._note_interval(row, sweep.t_ns - before.t_ns)
         self._since_set_up[row] += 1
         if sweep.crowded or self._crowds:
+            self._is_excess[row] = sweep.crowded and self._note_early(row, sweep.t_ns)
             self._note_crowd(row, sweep)
         if sweep.present != self._present[row]:
             self._present[row] = sweep.present
@@ -232,6 +244,12 @@ class BoardLedger:
     def all_complete(self) -> bool:
         """Whether the last sweep of every board had every enabled triangle: none is absent then."""
         return all(self._complete)
+
+    def is_excess(self, row: int) -> bool:
+        """Return whether a board's last sweep is too much to be processed: a board that is broken,
+        or hostile, sends as many as its bus carries.
+        """
+        return self._is_excess[row]
 
     @property
     def any_silent(self) -> bool:
@@ -356,6 +374,16 @@ class BoardLedger:
             elif apart < LEAST_APART_SHARE:
                 self.twice.pop(row, None)
             self._crowds[row] = _Crowd(t_ns, t_ns, number, t_ns, number)
+
+    def _note_early(self, row: int, t_ns: int) -> bool:
+        """Count a sweep that came too soon; return whether it is one too many."""
+        period_ns = int(self._period_ns[row])
+        passed_ns, self._early_ns[row] = max(t_ns - self._early_ns[row], 0), t_ns
+        early = max(self._early[row] - MOST_OFTEN * passed_ns / period_ns, 0.0)
+        is_excess = (early + 1.0) * period_ns > MOST_WAITING_NS
+        self._early[row] = early if is_excess else early + 1.0
+        self.excess[row] += is_excess
+        return is_excess
 
     def _note_interval(self, row: int, interval_ns: int) -> None:
         if not 0 < interval_ns < STALE_INTERVALS_NS:

@@ -68,6 +68,7 @@ _VALUE = np.where(_HEX == _INVALID, 1 << 8, _HEX.astype(np.uint16))
 _PAIRS = np.arange(1 << 16, dtype=np.uint16).view(np.uint8).reshape(-1, 2)
 _OCTET = _VALUE[_PAIRS[:, 0]] << 4 | _VALUE[_PAIRS[:, 1]]
 _NEWLINE = ord("\n")
+_BLANK_LINES = re.compile(rb"\n[\r\n]*\n")
 
 #: A classic frame as (identifier with flags, data, t_ns); None for any other message.
 Frame = tuple[int, bytes, int]
@@ -200,6 +201,10 @@ def _parse(
     unfinished.
     """
     known = len(names)
+    as_read = text
+    if b"\n\n" in text or b"\n\r\n" in text:
+        # A file of nothing else is a thousandth of its size when it is compressed.
+        text = _BLANK_LINES.sub(b"\n", text)
     buffer = np.frombuffer(text, np.uint8)
     ends = np.flatnonzero(buffer == _NEWLINE)
     if not len(ends) or ends[-1] != len(buffer) - 1:
@@ -232,6 +237,8 @@ def _parse(
         except DamageError as error:
             is_unfinished = is_end and row == n - 1 and not text.endswith(b"\n")
             kind = UnfinishedError if is_unfinished else DamageError
+            if as_read is not text:
+                number += _filled(as_read)[_filled(text).index(row)] - row
             damage = kind(f"line {number + row}: {error}")
             rows.kind[row:] = _EMPTY
             break
@@ -246,6 +253,11 @@ def _parse(
         rows = _Rows(*(column[frames] for column in rows))
     batch = RecordBatch(rows.id, rows.dlc, rows.data, rows.t_ns)
     return Block(list(names), rows.channel, batch, messages, damage)
+
+
+def _filled(text: bytes) -> list[int]:
+    """Which lines of a text are not blank, from 0."""
+    return [i for i, line in enumerate(text.split(b"\n")) if line.strip(b"\r")]
 
 
 def _decode_alike(

@@ -30,7 +30,7 @@ def open_port(
         clock: for waiting.
 
     Raises:
-        ConfigurationError: python-can has no such kind of interface.
+        ConfigurationError: python-can has no such kind of interface, or its package is missing.
         BusError: the interface is absent, down, not CAN, not permitted, or not supported, and
             `wait` is not set.
     """
@@ -83,7 +83,7 @@ def open_bus(name: str, bus: Bus) -> can.BusABC:
     """Open a bus for callers that use python-can directly, such as the emulator.
 
     Raises:
-        ConfigurationError: python-can has no such kind of interface.
+        ConfigurationError: python-can has no such kind of interface, or its package is missing.
         BusError: the interface is absent, down, not CAN, not permitted, or not supported.
     """
     if bus.interface == "socketcan":

@@ -236,11 +236,14 @@ def _calibration_path(arguments: argparse.Namespace, settings: "Settings") -> Pa
     Raises:
         NewerFileError: a newer version has written what is there.
         OtherRobotError: it is another robot's.
+        ConfigurationError: what was kept lies in the working directory.
     """
     from skin_host.daemon.calibrate import calibration_path
+    from skin_host.daemon.state import refuse_left_behind
     from skin_host.files import refuse_newer, refuse_other_robot
     from skin_host.processing.calibration.file import SCHEMA
 
+    refuse_left_behind(settings, arguments.config.parent)
     path: Path = arguments.output or calibration_path(settings, arguments.node)
     refuse_newer(path, SCHEMA, "calibration")
     if arguments.output is None:

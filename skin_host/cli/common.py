@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from skin_host.layout import Layout
 
 T = TypeVar("T")
+log = logging.getLogger(__name__)
 Commands = Any  # argparse's own type of sub-parser collections is private
 
 
@@ -155,14 +156,13 @@ def load_skin(config: Path) -> "tuple[Settings, Layout]":
     return layout.load_skin(config)
 
 
-def warn_of_virtual(settings: "Settings") -> None:
+def warn_of_virtual(settings: "Settings", tell: Callable[[str], object] = log.warning) -> None:
     """A bus that ends with its process has nobody else on it, which looks like dead boards."""
     for name, bus in settings.buses.items():
         if bus.interface == "virtual":
-            logging.getLogger(__name__).warning(
-                'bus %s: interface "virtual" is of this process alone, and no other program is on '
-                "it; use udp_multicast or vcan (docs/tutorial.md)",
-                name,
+            tell(
+                f'bus {name}: interface "virtual" is of this process alone, and no other program '
+                "is on it; use udp_multicast or vcan (docs/tutorial.md)"
             )
 
 

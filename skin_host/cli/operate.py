@@ -196,12 +196,14 @@ def _run_node(arguments: argparse.Namespace) -> int:
     from skin_host.daemon.alone import alone
     from skin_host.daemon.daemon import Daemon
     from skin_host.daemon.memory import remembered
+    from skin_host.daemon.state import refuse_left_behind
     from skin_host.daemon.workers import share_name, share_of
     from skin_host.layout import build_layout, parts_of
     from skin_host.processes import end_with_parent
 
     set_up_logging(arguments.verbose)
     settings, layout = load_skin(arguments.config)
+    refuse_left_behind(settings, arguments.config.parent)
     if arguments.workers is not None:
         return _run_workers(arguments, settings, layout)
     node = arguments.node

@@ -20,6 +20,7 @@ from skin_host.cli.common import (
     refuse_input,
     run,
     warn,
+    warn_of_virtual,
 )
 from skin_host.cli.options import add_rules
 from skin_host.errors import RequestError, SkinError
@@ -220,6 +221,8 @@ def _record(arguments: argparse.Namespace) -> int:
     if is_mcap(file):
         with Recorder(file) as recorder:
             told = run(partial(_capture, arguments, recorder, None), arguments.seconds)
+            if not recorder.messages:
+                _require_frames(arguments, 0)
         told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
     else:
         if arguments.config is None or arguments.broker is not None:
@@ -227,6 +230,7 @@ def _record(arguments: argparse.Namespace) -> int:
         settings, _ = load_skin(arguments.config)
         with CanLog(file, [bus.channel for bus in settings.buses.values()]) as log:
             told = run(partial(_capture, arguments, None, log), arguments.seconds)
+            _require_frames(arguments, log.frames)
         told |= {"frames": log.frames}
         told |= {"frames_left_out": log.left_out} if log.left_out else {}
         told |= {"times_moved": log.moved} if log.moved else {}
@@ -234,12 +238,22 @@ def _record(arguments: argparse.Namespace) -> int:
         print_json({"file": str(file)} | told)
     else:
         print(f"{file}: " + ", ".join(f"{key} {_plain(value)}" for key, value in told.items()))
-    if arguments.config is not None and not told.get("frames", told.get("messages", {}).get("can")):
-        raise SkinError(
-            f"{file}: no CAN frame came on the buses of {arguments.config}; is the bus up? "
-            "(An interface `virtual` reaches only its own program.)"
-        )
+    if "messages" in told:
+        _require_frames(arguments, told["messages"].get("can", 0))
     return 0
+
+
+def _require_frames(arguments: argparse.Namespace, frames: int) -> None:
+    """Refuse a recording of buses without frames; raised before its end, it leaves no file.
+
+    Raises:
+        SkinError: there are none.
+    """
+    if arguments.config is not None and not frames:
+        raise SkinError(
+            f"{arguments.file}: no CAN frame came on the buses of {arguments.config}; is the bus "
+            "up? (An interface `virtual` reaches only its own program.)"
+        )
 
 
 def _plain(value: Any) -> str:
@@ -385,6 +399,7 @@ async def _play_on_buses(arguments: argparse.Namespace) -> int:
     from skin_host.recording.playback import play_on_buses
 
     settings, _ = load_skin(arguments.config)
+    warn_of_virtual(settings, warn)
     with contextlib.ExitStack() as stack:
         buses = {
             name: stack.enter_context(open_bus(name, bus)) for name, bus in settings.buses.items()

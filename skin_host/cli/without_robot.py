@@ -326,7 +326,7 @@ def _on_emulated_chips(
             loop.add_reader(device.fileno(), device.handle)
         # A file or /dev/null cannot be waited for; then there are no commands.
         with contextlib.suppress(PermissionError, ValueError, AttributeError):
-            loop.add_reader(sys.stdin.fileno(), take_commands, robot, {}, bytearray(), model)
+            loop.add_reader(sys.stdin.fileno(), take_commands, robot, bytearray(), model)
         await robot.run(buses, RealClock(arguments.speed))
 
     return work
@@ -334,7 +334,6 @@ def _on_emulated_chips(
 
 def take_commands(
     robot: "Robot",
-    mends: dict[str, Callable[[], None]],
     begun: bytearray,
     model: "MujocoModel | None" = None,
 ) -> None:
@@ -345,7 +344,6 @@ def take_commands(
 
     Args:
         robot: is given the faults.
-        mends: the functions that end the given faults, by their lines.
         begun: a line whose end has not come.
         model: of the scene.
     """
@@ -368,32 +366,27 @@ def take_commands(
         try:
             if len(line) > LONGEST_COMMAND:
                 raise RequestError(f"a line of more than {LONGEST_COMMAND} bytes")
-            _take_command(robot, mends, line.decode(errors="replace"), model)
+            _take_command(robot, line.decode(errors="replace"), model)
         except RequestError as error:
             print(f"skin emulate: {visible(str(error))}", file=sys.stderr, flush=True)
 
 
-def _take_command(
-    robot: "Robot",
-    mends: dict[str, Callable[[], None]],
-    line: str,
-    model: "MujocoModel | None",
-) -> None:
+def _take_command(robot: "Robot", line: str, model: "MujocoModel | None") -> None:
     from emulator import faults
 
     text = " ".join(line.split())
     verb, _, rest = text.partition(" ")
     if verb == "mend":
-        if rest not in mends:
-            known = ", ".join(mends) or "none"
-            raise RequestError(f'"{rest}": no such fault is on; there are: {known}')
-        mends.pop(rest)()
+        if not (rest and robot.mend(faults.parse(rest))):
+            known = ", ".join(map(faults.line_of, robot.faults_on)) or "none"
+            why = f'"{rest}" is not on, is over or cannot be undone' if rest else "wanted a fault"
+            raise RequestError(f"mend: {why}; those that can be mended: {known}")
     elif verb == "ctrl":
         _set_control(model, rest)
     elif text:
         fault = faults.parse(text)
-        mends.pop(text, lambda: None)()  # the same again begins again
-        mends[text] = robot.inject(fault)
+        robot.mend(fault)  # the same again begins again
+        robot.inject(fault)
 
 
 def _set_control(model: "MujocoModel | None", text: str) -> None:

@@ -363,6 +363,11 @@ class Presence:
         stale = all(now_s - part.alive_s > self._stale_s for part in parts)
         return None if parts and stale else True
 
+    @property
+    def parts(self) -> Collection[str]:
+        """The parts of which a contact state or a touch was received."""
+        return self._parts.keys()
+
     def named(self) -> set[str] | None:
         """Return the parts that the robot's nodes name; None: that is not complete.
 
@@ -413,7 +418,7 @@ class Presence:
         """
         found = []
         for name, known in self._parts.items():
-            if not self._is_received(name, now_s):
+            if not self.is_received(name, now_s):
                 continue
             for number, (touch, at_s) in list(known.touches.items()):
                 if min(known.alive_s, now_s) - at_s > self._stale_s:
@@ -422,7 +427,7 @@ class Presence:
                     found.append(touch)
         return found
 
-    def _is_received(self, part: str, now_s: float) -> bool:
+    def is_received(self, part: str, now_s: float) -> bool:
         """Return whether what is known of a part is from now, as far as that shows."""
         state = self.contact(part, now_s)
         if state is not None:

@@ -470,6 +470,8 @@ class SkinClient:
         why = link.last_error or "it does not answer"
         if link.broker.v5 and "does not answer" in why:
             why += "; if it speaks MQTT 3.1.1 alone, end its URL with ?protocol=3.1.1"
+        if "closed the connection" in why and not link.broker.tls:
+            why += "; if it speaks TLS alone, begin its URL with mqtts://"
         if "no broker listens" in why:
             why += f"; start one, such as `mosquitto -p {link.broker.port}`, or name another"
         return BrokerError(f"broker {self.where}: cannot connect: {why}")

@@ -7,6 +7,7 @@ name the file and the path inside it. `docs/configuration.md` explains every key
 """
 
 import hashlib
+import os
 from collections.abc import Callable, Mapping
 from datetime import date, datetime, time
 from itertools import groupby
@@ -260,7 +261,8 @@ class Receive(_Table, frozen=True):
 class Service(_Table, frozen=True):
     """The daemon as a whole."""
 
-    #: Calibrations and recordings; default: systemd's $STATE_DIRECTORY, otherwise XDG state.
+    #: Calibrations and recordings, from the folder of the configuration; default: systemd's
+    #: $STATE_DIRECTORY, otherwise XDG state.
     state_directory: Printable | None = None
     #: Prometheus text on this port of localhost; 0 is off.
     metrics_port: Annotated[int, Meta(ge=0, le=65535)] = 0
@@ -383,8 +385,14 @@ def load(path: Path) -> Settings:
     }
     settings = read_toml(path, Settings, named)
     _check_references(path, settings)
-    relaxation = with_file(settings.processing.relaxation, path)
-    return changed(settings, {"processing.relaxation": relaxation})
+    values: dict[str, Any] = {
+        "processing.relaxation": with_file(settings.processing.relaxation, path)
+    }
+    place = settings.service.state_directory
+    if place is not None and not place.startswith("~"):
+        # Whole, because a running daemon's is compared with that of another working directory.
+        values["service.state_directory"] = os.path.realpath(path.parent / place)
+    return changed(settings, values)
 
 
 def _check_references(path: Path, settings: Settings) -> None:

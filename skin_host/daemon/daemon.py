@@ -21,7 +21,7 @@ from skin_host.daemon.calibrate import collect, keep_former
 from skin_host.daemon.control import Control
 from skin_host.daemon.lasting import LastingTouches
 from skin_host.daemon.link import Link, OpenPort
-from skin_host.daemon.memory import NodeMemory, remembered_with
+from skin_host.daemon.memory import NodeMemory, known_of, remembered_with
 from skin_host.daemon.state import (
     NodeState,
     Thresholds,
@@ -44,6 +44,7 @@ from skin_host.mqtt.info import CalibrationInfo, NodeInfo, node_info
 from skin_host.mqtt.publisher import Connect, Publisher
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration, Verdict, by_part
+from skin_host.processing.calibration.calibrator import going_on
 from skin_host.processing.calibration.file import find_calibration, save_calibration
 from skin_host.processing.calibration.run import SHORTEST_S
 from skin_host.processing.core import Engine, Output
@@ -265,6 +266,10 @@ class Daemon:
                     known, found, self.engine.layout.taxels_of(chosen), zeros=boards is None
                 )
             if before is not None:
+                if known is None:
+                    # What was known of boards that do not send goes on, as with `skin calibrate`.
+                    found = going_on(found, known_of(before, self._zeros, self.layout))
+                    found = calibrations.with_zeros(found, before.zeros | found.zeros)
                 found = calibrations.with_pressures_of(found, before)
             for name, taxels in calibrations.unchanged(found, self.layout).items():
                 log.warning("%s of %s: not calibrated, received too rarely", named(taxels), name)
@@ -346,16 +351,15 @@ class Daemon:
         return self._reloading.locked()
 
     async def reload(self) -> None:
-        """Read the configuration file again and send it to the boards.
+        """Read the configuration file again and use it.
 
-        Settings of processing and of the boards' set-up take effect; the calibration stays.
-        Requests that come during a reload share the next one, because each zeroes the boards.
+        The boards are not set up again: what they are sent changes by a restart only, and would
+        take what touches them for their zero. The calibration stays, too. Requests that come during
+        a reload share the next one.
 
         Raises:
             RequestError: the file is wrong, or changes what only a restart can change; then nothing
                 changes.
-            BusError: a bus does not take frames; the settings are in use, and its boards are set up
-                when it does.
         """
         begun = self._reloads
         async with self._reloading:
@@ -389,10 +393,8 @@ class Daemon:
             raise RequestError(f"{self._configuration}: {what} changed; that needs a restart")
         self._swap(settings, layout)
         self._configured = settings
-        log.info("%s read again; the boards are set up again", self._configuration)
-        # First: a bus that is down must not keep subscribers from where the taxels are now.
+        log.info("%s read again", self._configuration)
         self._put_info(await self.clock.in_thread(self._info))
-        await self.configure()
 
     def keep(self, state: NodeState) -> None:
         """Write what operators changed to the state directory.

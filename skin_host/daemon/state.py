@@ -8,6 +8,7 @@ and reported, so that the service can always start.
 import logging
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, TypeVar
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from skin_host.config.fields import Name
 from skin_host.config.settings import Settings, TouchSettings, changed
 from skin_host.daemon import service
+from skin_host.errors import ConfigurationError
 from skin_host.files import read_document, refuse_other_robot, set_aside, why_unreadable
 from skin_host.layout import Layout, PartLayout
 
@@ -141,6 +143,42 @@ def kept_path(settings: Settings, node: str, what: str) -> Path:
     """Return where a node keeps its `calibration`, `state` or `zeros`."""
     directory = service.state_directory(settings.service.state_directory)
     return directory / f"{settings.robot}-{node}.{what}.json"
+
+
+def refuse_left_behind(settings: Settings, folder: Path) -> None:
+    """Refuse to start without what was kept, where that lies in the working directory.
+
+    Relative names of the state directory start in the configuration's folder; they started in the
+    working directory in older versions. Without its memory a daemon would take what touches the
+    skin for its zero.
+
+    Args:
+        settings: of the robot.
+        folder: the configuration's.
+
+    Raises:
+        ConfigurationError: the state directory has nothing of the robot, and the folder of its name
+            in the working directory has.
+    """
+    if settings.service.state_directory is None:
+        return
+    place = service.state_directory(settings.service.state_directory)
+    try:
+        former = Path(os.path.realpath(os.path.relpath(place, os.path.realpath(folder))))
+    except OSError:  # the working directory is gone
+        return
+    if _keeps(former, settings.robot) and not _keeps(place, settings.robot):
+        raise ConfigurationError(
+            f'service.state_directory: {place} has nothing of robot "{settings.robot}", and '
+            f"{former} has: relative names start in the configuration's folder, and not in the "
+            f"working directory any more; move it: mv {former} {place}"
+        )
+
+
+def _keeps(folder: Path, robot: str) -> bool:
+    with suppress(OSError):
+        return any(one.match(f"{robot}-*.*.json") for one in folder.iterdir())
+    return False
 
 
 def can_be_read(path: Path, without: str) -> bool:

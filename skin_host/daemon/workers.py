@@ -28,6 +28,7 @@ from skin_host.processes import kept_from_children
 #: Daemons end touches, stop boards and disconnect within this time; systemd waits as long for all.
 STOP_S = 4.5
 _NOTIFICATION_BYTES = 4096
+LAST_PORT = 65535
 
 
 class Merged:
@@ -100,7 +101,8 @@ async def run(commands: dict[str, list[str]]) -> int:
             service.hold_hangups()  # until that daemon can take one
             with kept_from_children(*service.ENDING):  # until that daemon takes them
                 processes[name] = await asyncio.create_subprocess_exec(
-                    *(sys.executable, "-m", "skin_host", *arguments),
+                    # -P: this program, and not a folder of its name in the working directory.
+                    *(sys.executable, "-P", "-m", "skin_host", *arguments),
                     env=_environment(path),
                     # Ctrl-C of a terminal reaches only this process, which passes it on once.
                     start_new_session=True,
@@ -187,7 +189,7 @@ def share_of(settings: Settings, node: str, number: int, n: int) -> Settings:
         n: shares wanted, see `share_out`.
 
     Raises:
-        RequestError: there are fewer.
+        RequestError: there are fewer, or not so many ports for their metrics.
     """
     shares = share_out(settings, node, n)
     if number > len(shares):
@@ -203,8 +205,14 @@ def share_of(settings: Settings, node: str, number: int, n: int) -> Settings:
     for name, tip in settings.fingertips.items():
         if tip.node == node and tip.bus in buses:
             values[f"fingertips.{name}.node"] = share_name(node, number)
-    if settings.service.metrics_port:
-        values["service.metrics_port"] = settings.service.metrics_port + number - 1
+    port = settings.service.metrics_port
+    if port:
+        if port + len(shares) - 1 > LAST_PORT:
+            raise RequestError(
+                f"service.metrics_port: seen {port}, wanted at most {LAST_PORT + 1 - len(shares)}: "
+                f"{len(shares)} workers serve this port and those after it"
+            )
+        values["service.metrics_port"] = port + number - 1
     return changed(settings, values)
 
 

@@ -12,6 +12,7 @@ and the noise of the first seconds.
 """
 
 import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,6 +109,16 @@ class InsoleRecording:
             )
 
 
+def _is_archive(path: Path) -> bool:
+    """Whether a file begins and ends as an .npz does.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return zipfile.is_zipfile(file)
+
+
 def read(path: Path) -> InsoleRecording:
     """Read a recording: arrays `t_s`, `counts` and `pressure_kpa` of an .npz file.
 
@@ -116,9 +127,11 @@ def read(path: Path) -> InsoleRecording:
     """
     wanted = "wanted arrays t_s [t], counts uint8 [t, 280] and pressure_kpa [p] in one .npz"
     try:
+        if not _is_archive(path):  # numpy reads such a file otherwise, or advises to run it
+            raise ValueError("no archive of arrays")
         with np.load(path, allow_pickle=False) as arrays:
             t_s, counts, pressure = (arrays[n] for n in ("t_s", "counts", "pressure_kpa"))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise LogError(f"{path}: {str(error).splitlines()[0]}; {wanted}") from None
     seen = f"t_s {t_s.shape}, counts {counts.dtype} {counts.shape}, pressure_kpa {pressure.shape}"
     fits = counts.dtype == np.uint8 and counts.shape == (*t_s.shape, PADS) and pressure.ndim == 1

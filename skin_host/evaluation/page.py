@@ -56,9 +56,11 @@ def real_skin(document: Report) -> Section:
                 "over the whole recording while it is valid, median and 95th percentile over the "
                 "pads; then the RMS of the mean over the pads; the worst pad, which a percentile "
                 "hides; and the share of valid readings of usable pads that are off by more than "
-                "60 kPa, the press that every pad must detect. Pressures are paired with sweeps by "
-                "index, as the data's authors do; the last columns have one lag fitted to the "
-                "whole file."
+                "60 kPa, the press that every pad must detect. `all calibrated`: the same share of "
+                "all valid readings of all pads that the calibration keeps, so of those, too, that "
+                "are valid for less than half of the recording, and may be wrong whenever they "
+                "are. Pressures are paired with sweeps by index, as the data's authors do; the "
+                "last columns have one lag fitted to the whole file."
             ),
             *remarks_on_real(document),
             (

@@ -276,8 +276,12 @@ def measure(path: Path, fitted: Calibration | None) -> Row:
     course = play(recording, settings, layout, calibration)
     live = live_pads(recording)
     lasting = course.valid.mean(axis=0) >= VALID_SHARE
-    usable = live & calibration.usable[insole.pads(layout)] & lasting
+    calibrated = calibration.usable[insole.pads(layout)]
+    usable = live & calibrated & lasting
     errors = pressure_errors(recording, course, usable, why_not)
+    # A pad that is valid seldom may be wrong whenever it is.
+    far = None if why_not is not None else far_share(recording, course, calibrated)
+    errors["calibrated_far_share"] = far
     return touches(recording, course, live, usable) | errors
 
 
@@ -462,8 +466,7 @@ def pressure_errors(
     row |= {f"lagged_{name}": value for name, value in zip(names, errors(lag), strict=True)}
     row["lag_s"] = lag * period_s
     row["worst_rmse_kpa"] = float(of_each(0).max())
-    far = np.abs(kpa - true_kpa(0)[:, np.newaxis]) > FAR_KPA
-    row["far_share"] = float(np.mean(far[valid]))
+    row["far_share"] = far_share(recording, course, usable)
     here = valid.any(axis=0)
     row["hindsight"] = errors_in_hindsight(
         kpa[known][:, here], valid[known][:, here], true_kpa(0)[known]
@@ -471,6 +474,17 @@ def pressure_errors(
     at_zero = np.searchsorted(recording.t_ns, recording.t_ns[0] + round(ZERO_S * 1e9))
     row["zero_kpa"] = float(np.median(recording.pressure_kpa[:at_zero]))
     return row
+
+
+def far_share(recording: InsoleRecording, course: PlayedCourse, pads: Mask) -> float | None:
+    """Share of the valid readings of some pads [280] that are off by more than `FAR_KPA`; None if
+    none is valid.
+    """
+    paired = course.sweep < len(recording.pressure_kpa)
+    valid = course.valid[paired][:, pads]
+    true_kpa = recording.pressure_kpa[course.sweep[paired], np.newaxis]
+    far = np.abs(course.pressure_kpa[paired][:, pads] - true_kpa) > FAR_KPA
+    return float(np.mean(far[valid])) if valid.any() else None
 
 
 def _course(recording: InsoleRecording) -> tuple[Floats, float]:

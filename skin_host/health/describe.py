@@ -423,6 +423,7 @@ class Describer:
             "period_seen_ms": period_seen_ms,
             "jitter_ms": jitter_ms,
             "rezeros": int(ledger.rezeros[row]),
+            "excess": int(ledger.excess[row]),
             "in_doubt": int(np.count_nonzero(self._engine.zeros.in_doubt(index))),
         }
         manager = boards.get(board.settings.bus)

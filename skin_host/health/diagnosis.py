@@ -270,7 +270,13 @@ def _board(board: BoardHealth, load: float) -> Iterator[FoundFault]:
         yield fault("board_twice", ": two boards send at this address; give one of them another")
         return
     wanted, seen, jitter_ms = board["period_ms"], board["period_seen_ms"], board["jitter_ms"]
-    if board["alive"] and seen is not None and jitter_ms is not None:
+    if events.get("excess"):
+        yield fault(
+            "board_period",
+            f" sends far more often than every {wanted} ms: {board['excess']} of its sweeps were "
+            "too many to be processed; check its firmware, and what else sends at its address",
+        )
+    elif board["alive"] and seen is not None and jitter_ms is not None:
         if abs(seen - wanted) > PERIOD_SHARE * wanted:
             yield fault("board_period", f" sends every {seen:.1f} ms instead of {wanted} ms")
         elif jitter_ms > JITTER_SHARE * wanted and not board.get("held_up"):

@@ -67,7 +67,8 @@ class BoardHealth(TypedDict):
     `period_seen_ms` and `jitter_ms` come from the kernel's time stamps of its last sweeps;
     `in_doubt` counts taxels whose zero is unknown; `awaited`: since the start it has not had
     the time to send, or it paused and may have zeroed itself; `lately` has the counters among
-    `resets`, `lost_set_ups`, `tx_overflows` and `rezeros` that rose within the last minute;
+    `resets`, `lost_set_ups`, `tx_overflows`, `excess` and `rezeros` that rose within the last
+    minute; `excess` are sweeps that were too many to be processed;
     `twice`: two boards send at its address; `held_up`: it may be regular, but its frames waited
     for those of more urgent boards; `wrong_model` is the configured one if it reports another.
     """
@@ -85,6 +86,7 @@ class BoardHealth(TypedDict):
     period_seen_ms: float | None
     jitter_ms: float | None
     rezeros: int
+    excess: int
     in_doubt: int
     board_type: NotRequired[int | None]
     wrong_type: NotRequired[bool]

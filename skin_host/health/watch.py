@@ -268,7 +268,13 @@ class Watch:
     def _counts(self) -> tuple[object, ...]:
         """Return all that the boards are watched for: it rarely changes."""
         ledger = self._engine.ledger
-        events = (ledger.rezeros, ledger.resets, ledger.lost_set_ups, ledger.tx_overflows)
+        events = (
+            ledger.rezeros,
+            ledger.resets,
+            ledger.lost_set_ups,
+            ledger.tx_overflows,
+            ledger.excess,
+        )
         return tuple(counts.tobytes() for counts in events)
 
     def _totals(self, bus: str, port: "Port | None") -> dict[str, int]:
@@ -294,7 +300,7 @@ class Watch:
     def _events(self, index: int, watch: BoardWatch, boards: dict[str, "Boards"]) -> dict[str, int]:
         ledger = self._engine.ledger
         row = ledger.row[index]
-        events = {"rezeros": int(ledger.rezeros[row])}
+        events = {"rezeros": int(ledger.rezeros[row]), "excess": int(ledger.excess[row])}
         settings = self._engine.layout.boards[index].settings
         manager = boards.get(settings.bus)
         if manager is not None:

@@ -740,6 +740,8 @@ _HINTS = {
     "Not authorized": "check mqtt.username and its password",
     "Not authorised": "check mqtt.username and its password",
     "Bad user name or password": "check mqtt.username and its password",
+    "Protocol error": "what answers there is no MQTT broker; check host and port",
+    "wrong version number": "no TLS is spoken there; check the port, or leave TLS off",
     "Session taken over": "does a second daemon run as the same node?",
     "QoS not supported": "this node needs a broker that takes QoS 1",
     "Retain not supported": "this node needs a broker that retains messages",

@@ -33,7 +33,7 @@ from skin_host.processing.rezero import (
     look_s,
     repeats_of,
 )
-from skin_host.processing.silent_zero import SilentZero
+from skin_host.processing.silent_zero import STILL_SHARE, SilentZero
 
 #: So many conversions show that something presses a taxel which is not valid, ...
 GLIMPSED = 3
@@ -498,7 +498,7 @@ class BoardZeros:
             self.rezero(sweep.board)
 
     def _note_return(self, sweep: Sweep, silent_s: float) -> None:
-        """A board sends again: for half a second, see whether it was zeroed meanwhile.
+        """A board sends again: see whether it was zeroed meanwhile.
 
         Args:
             sweep: its first.
@@ -510,16 +510,24 @@ class BoardZeros:
         # What was set up since it was received last has a new zero, and one that is still sought
         # is that of the board as it is now. At a start, one is sought of pads in doubt only.
         sought = rezero is not None and rezero.seeks_all and math.isfinite(silent_s)
+        before = self._silent_zeros.get(sweep.board)
+        if before is not None and before.decided:
+            before = None
         if self._pipeline is None or self._calibration is None or sought:
             return
         taxels = self._of(sweep.board).ravel()
-        known = (taxels >= 0) & self._calibration.usable[taxels] & ~self._last_touched[taxels]
+        touched = (taxels >= 0) & self._last_touched[taxels]
+        if before is not None:
+            touched |= before.touched
+        known = (taxels >= 0) & self._calibration.usable[taxels] & ~touched
         known &= ~self.in_doubt(sweep.board).ravel()
         if rezero is not None:
             known &= ~rezero.cut_off
             if rezero.late is not None:
                 known &= ~rezero.late
         own = self._layout.boards[sweep.board].settings
+        read_units = float(own.no_load) - self._intake.bytes_of(self._ledger.row[sweep.board])
+        felt_units = self._pipeline.baseline[taxels] + self._pipeline.enter[taxels]
         self._silent_zeros[sweep.board] = SilentZero(
             self._pipeline.baseline[taxels],
             self._calibration.noise[taxels],
@@ -528,6 +536,9 @@ class BoardZeros:
             float(own.no_load),
             own.period_ms * 1e-3,
             silent_s,
+            touched,
+            STILL_SHARE * np.maximum(read_units, felt_units),
+            before,
         )
 
     def _judge_again(self, board: int) -> None:
@@ -553,6 +564,10 @@ class BoardZeros:
         if zeroed:
             if silent_zero.at_start:
                 self._judge_again(sweep.board)
+            else:
+                # It may have been taken for released since the board was taken for clear.
+                taxels = self._of(sweep.board).ravel()
+                self._last_touched[taxels[silent_zero.touched]] = True
             # What was read since is of the new zero.
             self._glimpses.pop(sweep.board, None)
             del self._silent_zeros[sweep.board]
@@ -560,7 +575,7 @@ class BoardZeros:
             return
         if silent_zero.at_start:
             return
-        if zeroed is None:
+        if zeroed is None and not silent_zero.clear:
             self._intake.veto[row] = np.ones((TRIANGLES, PADS), np.bool_)
             return
         rezero = self.rezeros.get(sweep.board)

@@ -130,6 +130,11 @@ class Engine:
                     ],
                     settings.receive.close_periods,
                     frozenset() if self.fingertips is None else self.fingertips.identifiers(bus),
+                    frozenset(
+                        board.settings.address
+                        for i, board in enumerate(layout.boards)
+                        if board.settings.bus == bus and i not in self.boards
+                    ),
                 )
                 for bus in sorted(buses)
             }
@@ -443,7 +448,8 @@ class Engine:
                 unclear = self.zeros.unclear(sweep.board)
                 if unclear is not None:
                     self._run.forget(unclear)
-            samples += self.intake.take(sweep, row)
+            if not self.ledger.is_excess(row):
+                samples += self.intake.take(sweep, row)
         return samples
 
     def _process(self, samples: list[PartSample]) -> list[Step]:

@@ -259,6 +259,11 @@ class Intake:
         """
         return bool(self._here[row, number])
 
+    def bytes_of(self, row: int) -> NDArray[np.uint8]:
+        """Return the bytes uint8[192] of the last sweep of a board (its row) that was taken."""
+        found: NDArray[np.uint8] = self._raw[row]
+        return found
+
     def missing(self) -> list[dict[int, int]]:
         """Of each part, the boards whose sweeps its next sample waits for."""
         return self._waits

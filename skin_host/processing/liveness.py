@@ -183,6 +183,7 @@ class Liveness:
         self._spike = np.maximum(SPIKE_UNITS, SPIKE_SIGMAS * noise_units)
 
         self._raw = np.zeros(shape, np.uint8)
+        #: Triangles whose last bytes show what has changed by the next ones.
         self._present = np.zeros(k, np.bool_)
         self._all_present = False
         # A step may be followed by the next one after so many sweeps of repeats.
@@ -203,6 +204,8 @@ class Liveness:
         self._spiked = np.zeros(shape, np.bool_)
         #: How many sweeps of each triangle could not be compared since its last spike.
         self._uncompared = np.zeros(k, np.int64)
+        #: How many sweeps each triangle has missed since it was received.
+        self._missed = np.zeros(k, np.int64)
         #: Triangles whose next step is one over a short gap, and whether there are any.
         self._over_gap = np.zeros(k, np.bool_)
         self._any_over_gap = False
@@ -334,18 +337,8 @@ class Liveness:
             self._raw[:] = raw
         else:
             np.copyto(self._raw, raw, where=present[:, None])
-        if came is None:
-            self._present[:] = present
-            self._all_present = all_present
-        else:
-            np.copyto(self._present, present, where=np.repeat(came, len(present) // len(came)))
-            self._all_present = self._present.tobytes() == self._fitted
-        if self._any_over_gap:
-            if came is None:
-                self._over_gap.fill(False)
-            else:
-                self._over_gap[np.repeat(came, len(present) // len(came))] = False
-            self._any_over_gap = any_of(self._over_gap)
+        if not whole or self._any_over_gap:
+            self._note_missed(present, erring, came)
         samples, changes = compared.view(np.int8), changed.view(np.int8)
         if felt is not None:
             samples, changes = samples * felt.calm, changes * felt.calm_pads
@@ -358,6 +351,23 @@ class Liveness:
             self._until_learning = RATE_SAMPLES - int(np.maximum.reduce(self._samples))
         self._doubt()
 
+    def _note_missed(self, present: Mask, erring: Mask, came: Mask | None) -> None:
+        """See which triangles were not received, or with an error, in a sweep; see `step`.
+
+        The bytes on both sides of a gap are compared, as a bus may lose some in every second sweep.
+        """
+        here = self._every if came is None else np.repeat(came, len(present) // len(came))
+        missed = here & ~present
+        self._missed[missed] += 1
+        self._missed[missed & erring] = FEW_MISSED + 1
+        self._missed[present] = 0
+        self._present &= self._missed <= FEW_MISSED
+        self._present |= present
+        self._all_present = self._present.tobytes() == self._fitted
+        self._over_gap &= ~here
+        self._over_gap |= missed & self._present
+        self._any_over_gap = any_of(self._over_gap)
+
     def note_gap(self, board: int, missed: int = 0) -> None:
         """Sweeps of a board (its row) were lost, so many if that is known: the next step does not
         follow the last one, and after many, what is received next is not compared with what was
@@ -368,11 +378,13 @@ class Liveness:
         mine = slice(triangles * board, triangles * (board + 1))
         self._step_left[mine] = 0
         self._uncompared[mine] += missed
-        if missed > FEW_MISSED:
-            self._present[mine] = False
-            self._all_present = False
-        elif missed:
-            self._over_gap[mine] = self._any_over_gap = True
+        if not missed:
+            return
+        self._missed[mine] += missed
+        self._present[mine] &= self._missed[mine] <= FEW_MISSED
+        self._all_present = self._present.tobytes() == self._fitted
+        self._over_gap[mine] = self._present[mine]
+        self._any_over_gap = any_of(self._over_gap)
 
     def keep(self, before: "Liveness", boards: Mask) -> None:
         """Take over the state of a predecessor for the same skin, for some boards (bool[boards]).

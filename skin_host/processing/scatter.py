@@ -6,10 +6,13 @@ nothing. What does is by how much, and that its moves take each other back: of i
 the next move takes back half of each in the mean, while a press that grows, ends, or is modulated
 at less than a quarter of the rate of sweeps goes on in the same direction as often as not.
 
-A press that is released between two sweeps would look like that, too: where a reading falls far,
-its moves speak against scatter. Within the range that a pad was measured in, nothing is found: a
-grip may tremble. Beyond it a reading is an estimate, and one that scatters is none. A press beyond
-the range that is modulated faster than that, and never released, looks the same.
+A press that is released between two sweeps would look like that, too: three readings in which one
+falls far speak against scatter, each three alike, however far the moves of the others are. A hand
+that taps releases for a third of the time or more; a contact that also opens now and then, for one
+reading of seven or fewer, is found by the others. Within the range that a pad was measured in,
+nothing is found: a grip may tremble. Beyond it a reading is an estimate, and one that scatters is
+none. A press beyond the range that is modulated faster than that, and never released, looks the
+same.
 """
 
 from collections.abc import Sequence
@@ -35,8 +38,10 @@ TAKEN_BACK = 1.0 / 6.0
 #: Of three readings in which the lowest is below this share of the highest, a press may have been
 #: released, on a pad that something else presses, too.
 RELEASED = 0.4
-#: Such three count against scatter by as much as three independent readings count for it.
-AGAINST = 0.5
+#: Such three count against scatter by this share of the square of a step: by as much as three
+#: independent readings count for it whose moves are all larger than a step. They are counted, not
+#: weighed by their moves: a fall is far larger than what a broken contact scatters by beside it.
+AGAINST = 1.0 / 3.0 - TAKEN_BACK
 #: A hand that presses five times a second moves one way for a tenth of one. Readings that are
 #: further apart show several moves of a hand, and are not compared; sweeps may be a quarter late.
 LONGEST_S = 0.125
@@ -58,7 +63,8 @@ class Scatter:
         least = 2.0 * MEMORY_CONVERSIONS * (LEAST_SHARE * step_kpa) ** 2
         self._least = least.astype(np.float32)
         #: Of pads that were beyond their range of late: what moves have taken back of those before
-        #: them, and the mean squares of both. Sums in kPa^2, of which the old ones fade.
+        #: them, less what counts against scatter; and the mean squares of both, of those readings
+        #: that count for it. Sums in kPa^2, of which the old ones fade.
         self._taken_back = np.zeros_like(step_kpa)
         self._moved = np.zeros_like(step_kpa)
         self._watched = False
@@ -105,7 +111,9 @@ class Scatter:
         lowest = np.minimum(np.minimum(readings[:-2], readings[1:-1]), readings[2:])
         counts = (highest > self._range[pads]) & (lowest >= RELEASED * highest)
         taken_back = -first * second
-        np.minimum(taken_back, -AGAINST * squares, out=taken_back, where=~counts)
+        against = np.float32(-AGAINST) * step * step
+        np.minimum(taken_back, against, out=taken_back, where=~counts)
+        squares *= counts
         remains = np.float32((1.0 - 1.0 / MEMORY_CONVERSIONS) ** len(first))
         sums = self._taken_back[pads] * remains + taken_back.sum(axis=0)
         moved = self._moved[pads] * remains + squares.sum(axis=0)

@@ -13,7 +13,15 @@ After a start of the daemon nobody knows how long it was not received: a moment,
 are tried then.
 
 What waited on the way, as behind a node that keeps the bus busy, comes at once afterwards and may
-be from before the zero: such sweeps are not compared.
+be from before the zero: such sweeps are not compared. The first after a silence may have waited,
+too, so it counts only among all ten.
+
+Most silences are a few lost sweeps, and many noisy pads show within two sweeps that nothing was
+zeroed. So do pads that were touched before the silence and still read half as much or more: a zero
+that was taken under the press would make them read none. So the board counts again as soon as
+either shows it, and goes on being compared. What still presses after a silence in which no touch
+would have ended was there all the time, whatever the others show: beside it pads are pressed too
+lightly for a touch, and had moved as those of a new zero do.
 """
 
 import math
@@ -23,6 +31,8 @@ from numpy.typing import NDArray
 
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.drift import SLOW_UNITS_PER_S
+from skin_host.processing.masks import Mask
+from skin_host.processing.touch import LOST_S
 
 #: So many sweeps are compared; pads of which fewer than half were received do not count.
 SWEEPS = 10
@@ -34,6 +44,14 @@ MOST_WAITED = 20
 #: A board was zeroed when its readings are so many times as probable then: a zero taken for none
 #: makes untouched pads read touches, and none taken for one costs a second (docs/found.md).
 ODDS = 100
+#: It need not wait for the other sweeps once they are so many times as probable without a zero, or
+#: this share of what was touched still is, and reads as large a share of what it did.
+CLEAR_NATS = math.log(1e4)
+STILL_SHARE = 0.5
+#: Of which a pad counts so much at most, squared, in standard deviations of a zero's readings.
+MOST_SQUARE = 25.0
+#: That takes a whole conversion, and so many sweeps: a single one may be damaged.
+CLEAR_SWEEPS = 2
 #: Rounding, and what the baseline of a pad drifts by itself (units, standard deviation).
 OWN_UNITS = 0.5
 #: What all pads of a board drift by together (units, standard deviation), however short the
@@ -52,7 +70,6 @@ RANGE_UNITS = 60.0
 BASELINE_S = 1.0
 
 Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 class SilentZero:
@@ -66,10 +83,18 @@ class SilentZero:
         no_load: the byte of an untouched pad just after a zero.
         period_s: how often the board sends.
         silent_s: for how long it was not received; infinite at a start, where nobody knows.
+        touched: bool[n], taxels that something touched before; none of them is known.
+        still_units: float64[n], a taxel that reads more than this is still touched.
+        before: the same after its last silence, if what came since then has not decided: its
+            baseline is still from before that.
 
     Attributes:
-        silent_s: as given.
+        silent_s, touched: as given.
+        still_units: as given, or those of `before`.
+        unseen_s: the same with all silences since the baseline was known.
         at_start: whether it is infinite.
+        clear: whether a zero is so improbable by now, at least one that hides a touch, that the
+            board may be taken for one that was not zeroed while it is compared further.
     """
 
     def __init__(
@@ -81,21 +106,38 @@ class SilentZero:
         no_load: float,
         period_s: float,
         silent_s: float,
+        touched: Mask | None = None,
+        still_units: Floats | None = None,
+        before: "SilentZero | None" = None,
     ) -> None:
         self._baseline = baseline
         self._noise = noise
         self._spread = spread
         self._known = known
+        self.touched: Mask = np.zeros_like(known) if touched is None else touched
+        if before is not None:
+            still_units = before.still_units
+        none = np.full(len(known), np.inf)
+        self.still_units: Floats = none if still_units is None else still_units
         self.silent_s = silent_s
-        self.at_start = math.isinf(silent_s)
+        self.unseen_s: float = silent_s + (0.0 if before is None else before.unseen_s)
+        self.at_start = math.isinf(self.unseen_s)
+        self.clear = False
+        #: Whether a touch has outlasted the silence.
+        self._outlasted = False
         self._no_load = no_load
         self._period_s = period_s
-        drifted = min(SLOW_UNITS_PER_S * silent_s, MOST_COMMON_UNITS)
+        drifted = min(SLOW_UNITS_PER_S * self.unseen_s, MOST_COMMON_UNITS)
         #: What all pads may have drifted by together, in units; each is as probable.
         self._drifted_units = [0.0, drifted] if self.at_start else [drifted]
         self._sum = np.zeros(len(known))
         self._count = np.zeros(len(known), np.int64)
         self._sweeps = 0
+        #: The first after a silence, in units, and what of it was received.
+        self._first: tuple[Floats, Mask] | None = None
+        #: How many others are compared, and how many must be before the board can be clear.
+        self._compared = 0
+        self._fewest = max(CLEAR_SWEEPS, math.ceil(CONVERSION_S / period_s))
         self._waited = 0
         self._last_ns: int | None = None
 
@@ -117,34 +159,78 @@ class SilentZero:
         soon = last_ns is not None and 0 <= t_ns - last_ns < soon_ns
         if soon and self._waited < MOST_WAITED:
             self._waited += 1
-            self._sum[:] = self._count[:] = self._sweeps = 0
+            self._sum[:] = self._count[:] = self._sweeps = self._compared = 0
+            self.clear = self._outlasted = False
+            self._first = None
             return None
-        self._sum += np.where(present, self._no_load - raw, 0.0)
-        self._count += present
         self._sweeps += 1
-        if self._sweeps < SWEEPS:
+        units = np.where(present, self._no_load - raw, 0.0)
+        if last_ns is None and not self.at_start:
+            self._first = units, present
             return None
-        return self.was_zeroed
+        self._add(units, present)
+        self._compared += 1
+        if self._sweeps >= SWEEPS:
+            if self._first is not None:
+                self._add(*self._first)
+            return self.was_zeroed
+        if not self.clear and not self.at_start and self._compared >= self._fewest:
+            self.clear = self._is_clear()
+        return None
+
+    def _add(self, units: Floats, present: Mask) -> None:
+        self._sum += units
+        self._count += present
+
+    def _is_clear(self) -> bool:
+        fewest = math.ceil(self._compared / 2)
+        still = self._still_touched(fewest)
+        self._outlasted = still and self.unseen_s <= LOST_S
+        evidence = self.evidence(fewest)
+        most = math.log(ODDS) if still else -CLEAR_NATS
+        return self._outlasted or evidence < most
+
+    def _still_touched(self, fewest: int) -> bool:
+        """Return whether what was touched before still is, by pads that came in so many sweeps."""
+        still = self.touched & (self._count >= fewest)
+        still &= self._sum > self.still_units * self._count
+        n = np.count_nonzero(self.touched)
+        if np.count_nonzero(still) < max(STILL_SHARE * n, 1):
+            return False
+        mean, variance = self._mean_of(still)
+        variance += np.square(self._noise[still]) + OWN_UNITS**2
+        squares = np.minimum(np.square(mean) / variance, MOST_SQUARE).sum()
+        # Chernoff's bound of how probable such a sum of squares is of a zero under the touch.
+        return bool(squares > n and squares - n * (1 + math.log(squares / n)) > 2 * CLEAR_NATS)
 
     @property
     def was_zeroed(self) -> bool:
         """Return whether what came so far shows that the board was zeroed."""
-        return self.evidence() > math.log(ODDS)
+        return not self._outlasted and self.evidence() > math.log(ODDS)
 
-    def evidence(self) -> float:
-        """Return how much more probable the readings are after a zero, as a natural logarithm."""
-        seen = self._known & (self._count >= FEWEST)
+    def evidence(self, fewest: int = FEWEST) -> float:
+        """Return how much more probable the readings are after a zero, as a natural logarithm.
+
+        Args:
+            fewest: pads that were received in fewer sweeps do not count.
+        """
+        seen = self._known & (self._count >= fewest)
         if not seen.any():
             return 0.0
-        count, baseline = self._count[seen], self._baseline[seen]
-        mean = self._sum[seen] / count
+        mean, variance = self._mean_of(seen)
+        # A zero is a single reading: its noise is in all that follow.
+        zeroed = self._log_likelihood(mean, variance + np.square(self._noise[seen]))
+        return zeroed - self._log_likelihood(mean - self._baseline[seen], variance)
+
+    def _mean_of(self, seen: Mask) -> tuple[Floats, Floats]:
+        """Return the means of some taxels, bool[n], in units, and how far noise takes each from its
+        baseline (variance).
+        """
+        count = self._count[seen]
         # Readings within one conversion repeat it; slower ones are each their own.
         independent = count * min(1.0, self._period_s / CONVERSION_S)
         share = 1.0 / np.maximum(independent, 1.0) + CONVERSION_S / BASELINE_S
-        variance = np.square(self._spread[seen]) * share
-        # A zero is a single reading: its noise is in all that follow.
-        zeroed = self._log_likelihood(mean, variance + np.square(self._noise[seen]))
-        return zeroed - self._log_likelihood(mean - baseline, variance)
+        return self._sum[seen] / count, np.square(self._spread[seen]) * share
 
     def _log_likelihood(self, residual: Floats, variance: Floats) -> float:
         """Return the logarithm of the likelihood of residuals [n], whatever the pads drifted by."""

@@ -12,6 +12,7 @@ marks are bounded.
 
 import asyncio
 import contextlib
+import errno
 import logging
 import os
 import queue
@@ -54,6 +55,8 @@ MAX_INCOMING = 100_000
 WAITING_BATCHES = 4096
 #: A folder holds no more recordings than this, because requests for them come from the network.
 MAX_RECORDINGS = 100
+#: So much of a disk is left to what the daemon keeps there, as whether something is touched.
+RESERVE_BYTES = 16 * 1024**2
 #: A disk that needs longer than this is no longer waited for.
 PATIENCE_S = 1.0
 #: A recording looks this often whether its time is over.
@@ -378,6 +381,15 @@ def _check_room(folder: Path, names: str) -> None:
         raise StateError(f"{folder}: holds {MAX_RECORDINGS} recordings already; move some away")
 
 
+def _full(file: Path | int, more: int = 0) -> str | None:
+    """Return why a recording must take no more bytes of the disk of a file; None if it may."""
+    disk = os.statvfs(file)
+    # Some file systems in user space do not know their size.
+    if not disk.f_blocks or disk.f_bavail * disk.f_frsize - more >= RESERVE_BYTES:
+        return None
+    return f"less than {RESERVE_BYTES >> 20} MiB of its disk are left, for what the daemon keeps"
+
+
 class FrameRecorder:
     """One recording, from now until it is stopped, is long enough, or fails.
 
@@ -389,7 +401,7 @@ class FrameRecorder:
 
     Raises:
         RequestError: the name is not that of a candump log, or the file exists.
-        StateError: the folder is full.
+        StateError: the folder is full, or the disk up to what is left to the daemon's own files.
         SkinError: the file cannot be made.
     """
 
@@ -409,6 +421,8 @@ class FrameRecorder:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             _check_room(path.parent, "*")
+            if (full := _full(path.parent)) is not None:
+                raise StateError(f"{path.parent}: {full}; move recordings away")
             try:
                 file = path.open("xb", buffering=0)
             except FileExistsError:
@@ -482,7 +496,7 @@ class FrameRecorder:
         """Write what is put until it is over.
 
         Raises:
-            OSError: the disk is full or gone.
+            OSError: the disk is gone, or full but for the reserve.
         """
         while self.ended is None:  # given up otherwise
             left_s = max(0.0, self._until_s - self._clock.monotonic_s())
@@ -500,6 +514,8 @@ class FrameRecorder:
                 self.ended = f"it reached its {self._max_bytes} bytes"
                 return
             refuse_removed(self.path)
+            if (full := _full(self._log.file.fileno(), len(lines))) is not None:
+                raise OSError(errno.ENOSPC, full)
             self._append(lines)
             self.frames += len(item[1])
 

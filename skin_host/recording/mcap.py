@@ -305,6 +305,11 @@ def read_records(path: Path) -> "Iterator[tuple[Schema | None, Channel, Message]
                         channels[record.id] = record
                     elif isinstance(record, records.Schema):
                         schemas[record.id] = record
+            if file.read(1):
+                raise LogError(
+                    f"{path}: goes on after its end, as two recordings one after the other; wanted "
+                    "one, or both joined by `mcap merge`"
+                )
         except LogError:
             raise
         except Exception as error:  # whatever a damaged file makes of its readers

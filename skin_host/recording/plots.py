@@ -1,6 +1,7 @@
 """Pictures of recordings and calibrations: `skin plot` (PNG, SVG or PDF by the suffix)."""
 
 import os
+from heapq import merge
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,11 @@ from skin_host.files import write_atomic, writing
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.calibration import Calibration, Verdict
 from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict
+from skin_host.processing.events import Touch
 from skin_host.recording.export import PartSeries, Series
+from skin_host.recording.export.known import STALE_S
+
+Floats = NDArray[np.float64]
 
 #: This many lines are distinguishable by their colours.
 MOST_LINES = 7
@@ -72,10 +77,11 @@ def plot_pressure(series: Series, output: Path, part: str, taxels: list[int] | N
     figure, (top, bottom) = _pyplot().subplots(
         2, 1, figsize=(9, 5), sharex=True, height_ratios=[5, 1], layout="constrained"
     )
+    t_s, kpa = _broken(series, one, taxels)
     for i, taxel in enumerate(taxels):
         top.plot(
-            one.t_s,
-            one.pressure_kpa[:, taxel],
+            t_s,
+            kpa[:, i],
             label=f"taxel {taxel}",
             color=COLOURS[i % len(COLOURS)],
             linestyle=("-", "--", ":")[i // len(COLOURS) % 3],
@@ -114,6 +120,14 @@ def plot_map(series: Series, output: Path, part: str, at_s: float | None = None)
                 f"its first at {first_s:.2f} s"
             )
         row = int(np.abs(one.t_s - at_s).argmin())
+        spanned = (one.t_s[:-1] < at_s) & (at_s < one.t_s[1:])
+        between = np.flatnonzero(spanned & _ends(series, one))
+        if between.size:
+            before = int(between[0])
+            raise RequestError(
+                f"{part}: nothing is known at {at_s:g} s; the frames before and after are at "
+                f"{one.t_s[before]:.2f} and {one.t_s[before + 1]:.2f} s"
+            )
     kpa = one.pressure_kpa[row]
     thermal = np.array([pad == "thermal" for pad in shape.pads])
     position_mm = np.array(shape.position_m) @ _face_on(np.array(shape.normal)).T * 1e3
@@ -237,16 +251,42 @@ def _part(series: Series, part: str) -> PartSeries:
     raise RequestError(f'no part "{part}"; there are: {there}')
 
 
+def _broken(series: Series, part: PartSeries, taxels: list[int]) -> tuple[Floats, Floats]:
+    """Return times (s), [m], and pressures of taxels [m, k] with a NaN wherever nothing was known
+    for a while: no line is drawn across.
+    """
+    at = np.flatnonzero(_ends(series, part)) + 1
+    kpa = part.pressure_kpa[:, taxels].astype(np.float64)
+    return np.insert(part.t_s, at, part.t_s[at - 1]), np.insert(kpa, at, np.nan, axis=0)
+
+
+def _ends(series: Series, part: PartSeries) -> NDArray[np.bool_]:
+    """Return after which frames of a part [n - 1] nothing was known of it for a while."""
+    gone_ns = [gone.t_ns for gone in series.gone if gone.part == part.name]
+    known = np.searchsorted(np.sort(gone_ns), part.t_ns)
+    steps_ns = np.diff(part.t_ns)
+    # Frames may be thinned to any rate.
+    usual_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
+    ends: NDArray[np.bool_] = steps_ns > max(STALE_S * 1e9, 2.0 * usual_ns)
+    return ends | (np.diff(known) > 0)
+
+
 def _contacts(series: Series, part: PartSeries) -> list[tuple[float, float]]:
-    """Return begin and end (s) of each contact of a part."""
+    """Return begin and end (s) of each contact of a part; it ends where nothing is known of it."""
     begun: dict[int, float] = {}
     spans = []
-    for touch in series.touches:
-        if touch.part != part.name:
-            continue
-        at_s = (touch.t_ns - int(part.t_ns[0])) * 1e-9
-        if touch.event == "end":
-            spans.append((begun.pop(touch.id, 0.0), at_s))
+    known_s = 0.0
+    gone: list[tuple[int, Touch | None]]
+    gone = [(one.t_ns, None) for one in series.gone if one.part == part.name]
+    touches = [(one.t_ns, one) for one in series.touches if one.part == part.name]
+    for t_ns, touch in merge(gone, touches, key=lambda one: one[0]):
+        at_s = (t_ns - int(part.t_ns[0])) * 1e-9
+        if touch is None:
+            spans += [(first_s, at_s) for first_s in begun.values()]
+            begun.clear()
+            known_s = at_s
+        elif touch.event == "end":
+            spans.append((begun.pop(touch.id, known_s), at_s))
         else:
             begun.setdefault(touch.id, at_s)
     spans += [(first_s, float(part.t_s[-1])) for first_s in begun.values()]

@@ -88,7 +88,8 @@ class _Wish(Struct, forbid_unknown_fields=True):
 
 
 class _Visit(ServerConnection):
-    """A connection; of too many the last are closed before anything is read.
+    """A connection; of too many the oldest that has asked for nothing is closed, as browsers and
+    others keep some that they do not use, and otherwise the last.
 
     While its peer does not read, nothing of it is read: the answers to its pings would wait in
     memory without end.
@@ -96,8 +97,9 @@ class _Visit(ServerConnection):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
-        if len(self.server.handlers) > MAX_CONNECTIONS:
-            self.transport.abort()
+        visits = [one for one in self.server.handlers if not one.transport.is_closing()]
+        if len(visits) > MAX_CONNECTIONS:
+            next((one for one in visits if one.request is None), self).transport.abort()
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)

@@ -113,15 +113,10 @@ async def test_more_connections_than_files_may_be_open_are_survived_in_silence(
                 except ConnectionError:
                     refused += 1
             assert refused >= 50
+            # The others are as many as there may be, and none of them asks for anything.
+            assert (await fetch(url))[0] == 200
             for _, writer in crowd:
                 writer.close()
-            async with asyncio.timeout(30):
-                while True:
-                    try:
-                        assert (await fetch(url))[0] == 200
-                        break
-                    except OSError:
-                        await asyncio.sleep(0.05)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     assert not [one for one in caplog.records if one.name in ("asyncio", "websockets.server")]

@@ -20,7 +20,8 @@ MS = 1_000_000
 PERIOD = 50 * MS
 
 
-def make(triangles: str = "0-3", boards: int = 1) -> Assembler:
+def make(triangles: str = "0-3", boards: int = 1, mine: int | None = None) -> Assembler:
+    """An assembler of the first so many boards, all by default; another node reads the others."""
     names = [f"b{i}" for i in range(boards)]
     skin = build_layout(
         Settings(
@@ -31,7 +32,12 @@ def make(triangles: str = "0-3", boards: int = 1) -> Assembler:
         ),
         Path(),
     )
-    return Assembler(list(enumerate(skin.boards)), close_periods=0.9)
+    others = skin.boards[len(skin.boards) if mine is None else mine :]
+    return Assembler(
+        list(enumerate(skin.boards[:mine])),
+        close_periods=0.9,
+        others=frozenset(board.settings.address for board in others),
+    )
 
 
 def values(n: int, seed: int = 0) -> np.ndarray:
@@ -259,6 +265,16 @@ def test_strangers_are_counted():
     feed(assembler, frames(values(1), PERIOD, board=9) + frames(values(3), PERIOD))
     assert assembler.counters.unknown_board == 2
     assert assembler.counters.unknown_triangle == 2
+
+
+def test_boards_that_another_node_reads_are_no_strangers():
+    assembler = make("0-1", boards=2, mine=1)
+    sent = frames(values(2), PERIOD) + frames(values(2), PERIOD, board=2)
+    sweeps = feed(assembler, sent + frames(values(1), PERIOD, board=9))
+    assert [sweep.board for sweep in sweeps] == [0]
+    assert assembler.counters.other == 4
+    assert assembler.counters.unknown_board == 2
+    assert assembler.unconfigured == {9: 2}
 
 
 def test_a_full_bus_of_fourteen_boards_is_kept_apart():

@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.bus.assembler import Sweep
-from skin_host.bus.ledger import ALONE_NS, LONGEST_PAUSE_NS, TWICE_NS, BoardLedger
+from skin_host.bus.ledger import (
+    ALONE_NS,
+    LONGEST_PAUSE_NS,
+    MOST_OFTEN,
+    MOST_WAITING_NS,
+    TWICE_NS,
+    BoardLedger,
+)
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings, load
 from skin_host.layout import BoardLayout, build_layout
 from tests.support.stack import ROOT
@@ -512,3 +519,53 @@ def test_sweeps_that_two_boards_cut_into_pieces_are_of_two() -> None:
         for number in range(15):
             address.note(address.t_ns + number * MS // 2)
     assert address.twice
+
+
+def flooded(seconds: float, every_ms: float) -> BoardLedger:
+    """After a board has sent so often, while the other one sends in its period."""
+    known = ledger()
+    due_ns = T0
+    for number in range(round(seconds * 1e3 / every_ms)):
+        t_ns = T0 + round(number * every_ms * 1e6)
+        known.note(sweep(HAND, t_ns, crowded=number > 0 and 2 * every_ms * 1e6 < PERIOD))
+        if t_ns >= due_ns:
+            due_ns += PERIOD
+            known.note(sweep(OUTER, t_ns))
+            assert not known.is_excess(1)
+    return known
+
+
+@pytest.mark.parametrize("every_ms", [0.4, 1.0, 9.0])
+def test_of_a_board_that_floods_its_bus_so_many_sweeps_are_too_many_and_all_are_counted(
+    every_ms: float,
+) -> None:
+    known = flooded(20.0, every_ms)
+    sent = int(known.sweeps[0])
+    taken = sent - int(known.excess[0])
+    at_once, later = MOST_WAITING_NS / PERIOD, MOST_OFTEN * 20e9 / PERIOD
+    assert abs(taken - (at_once + later)) <= 2
+    assert known.excess[1] == 0
+
+
+@pytest.mark.parametrize("every_ms", [10.0, 12.0, 24.0, 26.0, 50.0])
+def test_a_board_that_sends_up_to_five_times_as_often_is_processed_whole(every_ms: float) -> None:
+    assert not flooded(20.0, every_ms).excess.any()
+
+
+def test_what_waited_while_a_computer_was_busy_is_not_too_much() -> None:
+    address = Crowd()
+    for _ in range(5):
+        address.send(10.0)
+        address.burst(9.0)
+    assert not address.known.excess.any()
+
+
+def test_a_board_that_has_flooded_is_processed_again_when_it_is_over() -> None:
+    known = flooded(12.0, 0.5)
+    assert known.is_excess(0)
+    known.note(sweep(HAND, T0 + 13_000 * MS))
+    assert not known.is_excess(0)
+    before = int(known.excess[0])
+    for number in range(100):
+        known.note(sweep(HAND, T0 + 13_050 * MS + number * PERIOD))
+    assert known.excess[0] == before

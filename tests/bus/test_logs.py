@@ -2,6 +2,7 @@
 
 import gc
 import gzip
+import io
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -10,7 +11,10 @@ import can
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from skin_host.bus import logs
 from skin_host.bus.logs import WINDOW_NS, read_channels
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings
@@ -240,6 +244,43 @@ def test_frames_of_can_fd_are_passed_over(tmp_path):
 def test_a_time_that_no_clock_shows_ends_a_recording(tmp_path):
     far = candump(tmp_path / "far.log", ["(1.0) can0 4E0#40", "(99999999999999.0) can0 4E0#40"])
     assert "damaged after frame 1: line 2: a time of 1e+14 s" in message_of(far)
+
+
+BLANK = st.lists(st.sampled_from([b"\n", b"\r\n"]), max_size=4).map(b"".join)
+
+
+@given(blanks=st.lists(BLANK, min_size=1, max_size=6), size=st.integers(1, 90))
+def test_blank_lines_change_neither_frames_nor_the_number_of_a_damaged_line(blanks, size):
+    text, wanted = b"", []
+    for i, blank in enumerate(blanks):
+        text += blank + b"(%d.000000) can0 4E0#40\n" % i
+        wanted.append(i * 10**9)
+    number = text.count(b"\n") + 2
+    text += b"\nnonsense\n"
+    seen = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(logs, "BLOCK_BYTES", size)
+        for block in logs.read_blocks(io.BytesIO(text), lambda _: None):
+            seen += block.batch.t_ns.tolist()
+    assert seen == wanted
+    assert str(block.damage).startswith(f"line {number}: ")
+
+
+def test_blank_lines_make_no_rows(monkeypatch):
+    """300 MB of them, which are little when they are compressed, took a minute."""
+    sizes = []
+
+    class Rows(logs._Rows):
+        def __new__(cls, *columns):
+            sizes.append(len(columns[0]))
+            return super().__new__(cls, *columns)
+
+    monkeypatch.setattr(logs, "_Rows", Rows)
+    blank = b"\n" * 100_000 + b"\r\n" * 100_000
+    text = blank + b"(1.000000) can0 4E0#40\n" + blank
+    blocks = list(logs.read_blocks(io.BytesIO(text), lambda _: None))
+    assert sum(len(block.batch) for block in blocks) == 1
+    assert max(sizes) < 10
 
 
 def test_cut_files_are_told(tmp_path):

@@ -15,7 +15,7 @@ from skin_host.bus.opening import open_bus, open_port
 from skin_host.bus.port import LinkState, Port
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Receive
-from skin_host.errors import BusError
+from skin_host.errors import BusError, ConfigurationError
 from tests.support.datagrams import FRAME
 from tests.support.waiting import PATIENCE_S
 
@@ -323,8 +323,12 @@ def test_an_adapter_whose_package_is_not_installed_names_it(monkeypatch, interfa
         raise can.CanInterfaceNotImplementedError("the module is not installed")
 
     monkeypatch.setattr("can.Bus", absent)
-    with pytest.raises(BusError, match=rf"mend it with: pip install 'python-can\[{extra}\]'"):
-        open_bus("left", Bus(interface=interface, channel="/dev/none"))
+    bus = Bus(interface=interface, channel="/dev/none")
+    with pytest.raises(ConfigurationError, match=rf"pip install 'python-can\[{extra}\]'"):
+        open_bus("left", bus)
+    # A daemon that waited for it said that an adapter was to be plugged in.
+    with pytest.raises(ConfigurationError, match=rf"pip install 'python-can\[{extra}\]'"):
+        open_port("left", bus, Receive(), wait=True)
 
 
 def test_an_adapter_that_lacks_its_options_names_where_they_are_given():

@@ -15,6 +15,7 @@ import pytest
 
 from skin_host.cli import build_parser, main, watch
 from skin_host.config.settings import load, skin_hash
+from skin_host.daemon.state import refuse_left_behind
 from skin_host.layout import build_layout
 from skin_host.processing.calibration.calibrator import Calibrator
 from skin_host.processing.calibration.file import load_calibration
@@ -363,6 +364,30 @@ def test_a_connection_that_ended_is_not_taken_for_a_reader_that_read_enough(monk
 
     monkeypatch.setattr("skin_host.cli.files._check", broken)
     refused(asked("check", str(DEMO)), 1, "Broken pipe")
+
+
+@pytest.mark.parametrize(
+    "command", [["run"], ["run", "--workers", "2"], ["calibrate"], ["run", "--node", "none"]]
+)
+def test_what_was_kept_in_the_working_directory_is_not_left_behind(tmp_path, monkeypatch, command):
+    """Without its memory a daemon would take what is pressed at its start for the zero."""
+    folder = tmp_path / "robots"
+    folder.mkdir()
+    config = folder / "robot.toml"
+    config.write_text(DEMO.read_text() + '[service]\nstate_directory = "state"\n')
+    former = tmp_path / "state"
+    former.mkdir()
+    (former / "demo-main.zeros.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    result = asked(command[0], "robots/robot.toml", *command[1:])
+    refused(result, 2, "service.state_directory", f"mv {former} {folder / 'state'}")
+    # With something there, or of another robot, nothing is left behind.
+    (former / "demo-main.zeros.json").rename(former / "demo2-main.zeros.json")
+    refuse_left_behind(load(config), folder)
+    (former / "demo-main.zeros.json").write_text("{}")
+    (folder / "state").mkdir()
+    (folder / "state" / "demo-main.state.json").write_text("{}")
+    refuse_left_behind(load(config), folder)
 
 
 def test_a_kept_calibration_of_another_skin_stops_the_daemon_before_it_begins(tmp_path):

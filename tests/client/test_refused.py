@@ -11,7 +11,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
 from skin_host.cli import main
-from skin_host.client import CommandError, Contact, SkinCallbacks
+from skin_host.client import CommandError, Contact, SkinCallbacks, SkinClient
 from skin_host.errors import BrokerError
 from skin_host.mqtt.connection import Connection
 from tests.client.test_client import hearing, publishing, take, touch
@@ -19,6 +19,8 @@ from tests.support.broker import Mosquitto
 from tests.support.waiting import PATIENCE_S, until
 
 NOT_AUTHORIZED = 0x87
+#: What a web server answers.
+WEB = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 200\r\n\r\n" + b" " * 200
 
 
 @pytest.fixture
@@ -178,3 +180,27 @@ async def test_a_command_whose_broker_falls_silent_is_given_up(mosquitto: Mosqui
         with pytest.raises(CommandError, match="the broker does not answer"):
             await skin.command("status", node="main", timeout_s=10 * PATIENCE_S)
         mosquitto.resume()
+
+
+@pytest.mark.parametrize(
+    ("scheme", "answer", "remedy"),
+    [
+        ("mqtt", WEB, "check host and port"),
+        ("mqtts", WEB, "leave TLS off"),
+        ("mqtt", b"", "begin its URL with mqtts://"),
+    ],
+    ids=["a web server", "a server without TLS", "one that closes, as with TLS alone"],
+)
+async def test_what_is_no_such_broker_is_an_error_that_names_a_remedy(
+    scheme: str, answer: bytes, remedy: str
+) -> None:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read(1000)
+        writer.write(answer)
+        writer.close()
+
+    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        port = server.sockets[0].getsockname()[1]
+        with pytest.raises(BrokerError, match=remedy):
+            async with SkinClient(f"{scheme}://127.0.0.1:{port}", robot="a", patience_s=0.5):
+                pass

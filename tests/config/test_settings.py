@@ -476,3 +476,27 @@ def test_a_calibration_does_not_fit_other_boards(tmp_path: Path) -> None:
 
 def test_the_demo_builds() -> None:
     assert build_layout(load(DEMO), DEMO.parent).n_taxels == 396
+
+
+@pytest.mark.parametrize(
+    ("place", "wanted"),
+    [
+        ("state", "robots/state"),
+        ("../state", "state"),
+        ("", "robots"),
+        ("/var/lib/x", "/var/lib/x"),
+        ("~/x", "~/x"),
+    ],
+)
+def test_a_state_directory_is_the_same_from_every_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, wanted: str
+) -> None:
+    folder = tmp_path / "robots"
+    folder.mkdir()
+    path = written(folder, "service.state_directory", place)
+    expected = wanted if wanted.startswith("~") else str(tmp_path / wanted)
+    assert load(path).service.state_directory == expected
+    monkeypatch.chdir(tmp_path)
+    assert load(path.relative_to(tmp_path)).service.state_directory == expected
+    monkeypatch.chdir(folder)
+    assert load(Path(path.name)).service.state_directory == expected

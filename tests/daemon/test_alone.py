@@ -2,6 +2,7 @@
 
 import os
 import signal
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -48,6 +49,17 @@ def test_a_second_one_is_refused_until_the_first_has_ended(settings: Settings) -
             pass
     with alone(settings, "main"):
         pass
+
+
+def test_another_user_is_refused_too(settings: Settings, tmp_path: Path) -> None:
+    """Who cannot open the lock does not notice it; systemd's service has a umask of 0077."""
+    before = os.umask(0o077)
+    try:
+        with alone(settings, "main"):
+            (lock,) = (tmp_path / "state").glob("*.lock")
+            assert stat.S_IMODE(lock.stat().st_mode) == 0o644
+    finally:
+        os.umask(before)
 
 
 def test_a_process_that_is_killed_leaves_the_node_to_others(config: Path) -> None:

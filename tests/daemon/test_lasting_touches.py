@@ -16,9 +16,10 @@ from emulator.probes.scene import Fault, Place, Probe, Scene
 from emulator.robot import Robot
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, changed, load
-from skin_host.daemon.calibrate import stored_calibration, take_calibration
+from skin_host.daemon.calibrate import take_calibration
 from skin_host.daemon.daemon import Daemon
 from skin_host.daemon.lasting import LOOK_S, UNTOUCHED_S, LastingTouches
+from skin_host.daemon.memory import remembered
 from skin_host.files import write_document
 from skin_host.layout import build_layout, parts_of
 from skin_host.mqtt.messages import ContactState
@@ -121,12 +122,8 @@ class Lives:
         self._stop = asyncio.Event()
 
     async def start(self, **run: Any) -> None:
-        calibration = stored_calibration(self.settings, self.layout, "main")
-        if run:
-            calibration = None
-        self.daemon = daemon = Daemon(
-            self.settings, self.layout, calibration=calibration, clock=self.clock
-        )
+        memory = remembered(self.settings, self.layout, "main", take_new=bool(run))
+        self.daemon = daemon = Daemon(self.settings, self.layout, memory=memory, clock=self.clock)
         self.contact = {}
         daemon.publisher.put_contact = self.contact.__setitem__  # type: ignore[method-assign]
         self._stop = asyncio.Event()
@@ -293,6 +290,32 @@ async def test_a_start_that_calibrates_in_a_grip_names_what_is_pressed(
         await live.start(calibrate=True)
         assert "nothing has shown that this is over" in caplog.text
         assert "the skin was touched while it was calibrated" in caplog.text
+
+
+@stepped
+async def test_a_start_that_calibrates_keeps_what_is_known_of_a_board_that_is_dead(
+    clock: SteppedClock, tmp_path: Path
+) -> None:
+    """As `skin calibrate` does: the board was not valid when it came back, until calibrated."""
+    async with lives(clock, tmp_path) as live:
+        await live.until(4.0)
+        before = live.daemon.engine.calibration
+        await live.end()
+        mend = live.robot.inject(Fault(name="board_silent", board="forearm_outer"))
+        await live.start(calibrate=True)
+        found = live.daemon.engine.calibration
+        assert before is not None
+        assert found is not None
+        dead = live.layout.taxels_of([list(live.settings.boards).index("forearm_outer")])
+        assert found.id != before.id
+        assert found.usable[dead].all()
+        assert found.unchanged is not None
+        assert np.array_equal(found.unchanged, dead)
+        mend()
+        await clock.sleep(12.0)
+        record = live.daemon.records()["left_forearm"]
+        assert record["valid_taxels"] == record["taxels"]
+        assert live.contact["left_forearm"] == "OFF"
 
 
 @stepped

@@ -54,6 +54,8 @@ async def test_a_board_of_another_node_is_no_stranger(clock: SteppedClock, tmp_p
         await clock.sleep(20.0)
         for daemon in daemons:
             assert not daemon.link.boards["can0"].strangers
+            counters = daemon.engine.assemblers["can0"].counters
+            assert counters.unknown_board == counters.unknown_triangle == 0
             for record in daemon.records().values():
                 assert record["state"] in ("ok", "warning")
                 codes = {fault["code"] for fault in record["faults"]}

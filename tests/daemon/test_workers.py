@@ -215,6 +215,18 @@ async def test_a_stop_before_a_daemon_has_begun_is_a_clean_end(
     assert b"Traceback" not in told
 
 
+async def test_a_folder_of_the_same_name_in_the_working_directory_is_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "skin_host"
+    other.mkdir()
+    (other / "__init__.py").touch()
+    (other / "__main__.py").write_text("open('run', 'w').close()")
+    monkeypatch.chdir(tmp_path)
+    assert await workers.run({"main-1": ["--version"]}) == 0
+    assert not (tmp_path / "run").exists()
+
+
 async def states(broker: Mosquitto) -> dict[str, bytes]:
     """What is retained of the robot, once both nodes have said how their parts are."""
     found: dict[str, bytes] = {}
@@ -291,6 +303,18 @@ def test_a_share_that_is_none_is_refused_in_a_line(
     assert ended.value.code == 2
     (said,) = capsys.readouterr().err.splitlines()
     assert said.isprintable()
+
+
+def test_workers_without_ports_for_their_metrics_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from skin_host.cli import main
+
+    path = body(tmp_path / "body.toml", [("a", [0]), ("b", [1])])
+    path.write_text(path.read_text().replace("[service]", "[service]\nmetrics_port = 65535"))
+    assert main(["run", str(path), "--workers", "2"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "service.metrics_port: seen 65535, wanted at most 65534" in line
 
 
 def test_workers_of_a_node_without_parts_are_refused(

@@ -651,3 +651,72 @@ def test_the_page_of_faults_has_a_result_in_time_for_each_on_every_firmware() ->
     assert all(len(row) == 9 for row in cells)
     for _, _, within, *measured in cells:
         assert all(float(one.split(" s")[0]) <= float(within.split(" s")[0]) for one in measured)
+
+
+@pytest.mark.parametrize("line", ["bus_off bus=can0 bus=can1", "bus_off name=bus_on bus=can0"])
+def test_a_key_of_a_line_that_is_given_twice_is_refused(line: str) -> None:
+    """The last one was taken without a word."""
+    with pytest.raises(ConfigurationError, match="is given twice"):
+        parse(line)
+
+
+class TestWhichAreOn:
+    """Each fault that is on can be ended by its line, whoever began it, and no other is listed."""
+
+    @pytest.fixture
+    def plain(self) -> Robot:
+        return make()
+
+    def test_one_that_is_over_is_not_on(self, plain: Robot) -> None:
+        plain.inject(parse("frame_loss bus=can0 until_s=0.2"))
+        assert [fault.name for fault in plain.faults_on] == ["frame_loss"]
+        plain.step(0.3)
+        assert plain.faults_on == []
+        assert not plain.mend(parse("frame_loss bus=can0"))
+
+    @pytest.mark.parametrize(
+        "line",
+        [
+            "board_reset board=hand",
+            "brown_out board=hand triangle=2",
+            "chip_back board=hand triangle=2",
+        ],
+    )
+    def test_one_that_cannot_be_undone_is_not_on(self, line: str, plain: Robot) -> None:
+        plain.inject(parse(line))
+        assert plain.faults_on == []
+        assert not plain.mend(parse(line))
+
+    def test_a_chip_that_is_back_is_not_gone(self, plain: Robot) -> None:
+        plain.inject(parse("chip_gone board=hand triangle=2"))
+        plain.inject(parse("chip_back board=hand triangle=2"))
+        assert plain.faults_on == []
+
+    def test_a_shorted_line_is_on_until_its_last_chip_is_back(self, plain: Robot) -> None:
+        plain.inject(parse("shorted_finger board=hand triangle=0"))
+        plain.inject(parse("chip_back board=hand triangle=0"))
+        assert [fault.name for fault in plain.faults_on] == ["shorted_finger"]
+        assert plain.mend(parse("shorted_finger board=hand triangle=0"))
+        assert plain.faults_on == []
+
+    @pytest.mark.parametrize(
+        ("begun", "mended"),
+        [
+            ("frame_loss bus=can0", "frame_loss value=0.00660 bus=can0"),
+            ("frame_loss bus=can0", "frame_loss bus=can0 until_s=3"),
+            ("chip_gone board=hand triangle=2", "chip_gone triangle=2 board=hand value=65535"),
+        ],
+    )
+    def test_it_is_the_same_however_it_is_written(
+        self, begun: str, mended: str, plain: Robot
+    ) -> None:
+        plain.inject(parse(begun))
+        assert plain.mend(parse(mended))
+        assert plain.faults_on == []
+
+    def test_one_of_the_scene_can_be_mended(self) -> None:
+        fault = Fault(name="bus_off", bus="can0", at_s=0.05)
+        robot = make(Scene(noise=False, fault=[fault]))
+        assert robot.faults_on == [fault]
+        assert robot.mend(parse("bus_off bus=can0"))
+        assert not robot.wires["can0"].off

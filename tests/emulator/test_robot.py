@@ -26,7 +26,7 @@ from skin_host.bus.wire import FrameBatch, find_skin_frames
 from skin_host.clock import SteppedClock
 from skin_host.config import settings as configurations
 from skin_host.config.settings import Settings, changed
-from skin_host.errors import ConfigurationError, LogError
+from skin_host.errors import ConfigurationError, LogError, RequestError
 from skin_host.layout import Layout, build_layout
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -591,3 +591,46 @@ def test_others_on_an_i2c_line_of_the_robot_find_its_chips_at_work() -> None:
     robot.step(0.1)
     line.i2c_rdwr(pointer, results)
     assert any(bytes(results))
+
+
+@pytest.mark.parametrize("dt_s", [-1.0, -1e-9, float("nan"), float("inf")])
+def test_time_goes_forward_only(dt_s: float) -> None:
+    """A second back was taken without a word, and the boards sent nothing until then."""
+    robot = Robot(*load())
+    robot.step(1.0)
+    with pytest.raises(RequestError, match="dt_s: seen"):
+        robot.step(dt_s)
+    assert robot.t_ns == 1_000_000_000
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
+def test_a_probe_is_pressed_and_pulled_by_numbers_only(number: float) -> None:
+    """Pressing by NaN pressed nothing, without a word."""
+    robot = Robot(*load())
+    finger = robot.touch(Probe(part="left_hand", at=Place(taxel=3), force_n=[(0, 0)]))
+    with pytest.raises(RequestError, match="drive: seen"):
+        finger.press(number)
+    with pytest.raises(RequestError, match="x_mm: seen"):
+        finger.press(1.0, number)
+    with pytest.raises(RequestError, match="force_n: seen"):
+        finger.pull(number)
+
+
+async def test_time_that_is_left_out_in_whole_periods_of_many_seconds_is_not_taken_back() -> None:
+    """Boards of 48 and 125 ms are in step every 6 s: more than had passed was left out."""
+    robot, clock = Robot(*load()), SteppedTime()
+    robot.bring_up()
+    hand, *_ = robot.boards.values()
+    for board in robot.boards.values():
+        board.period_ns = 48_000_000
+    hand.period_ns = 125_000_000
+    lived_ns = [robot.t_ns]
+    with can.Bus(interface="virtual", channel="test-whole-periods") as inside:
+        life = asyncio.create_task(robot.run({"can0": inside}, clock))
+        for passed_s in (0.1, 11.5, *[0.05] * 20):
+            await clock.advance(passed_s)
+            lived_ns.append(robot.t_ns)
+            assert not life.done()
+        life.cancel()
+    assert lived_ns == sorted(lived_ns)
+    assert lived_ns[-1] > lived_ns[2]

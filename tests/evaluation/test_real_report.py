@@ -72,6 +72,10 @@ UNLOADED = recording(
 UNUSED = np.zeros(PADS, np.bool_)
 
 
+def document_of(row: real.Row) -> real.Row:
+    return {"real": [row], "published": [], "grasps": None, "emulated": [], "absent": None}
+
+
 @pytest.fixture(scope="module")
 def pressed() -> InsoleRecording:
     return recording(ramp())
@@ -240,10 +244,54 @@ def test_the_worst_pad_and_readings_that_are_far_off_are_named_however_few_they_
     assert row["worst_rmse_kpa"] == pytest.approx(80.0 * np.sqrt(100 / t), rel=1e-4)
     assert row["far_share"] == pytest.approx(100 / (t * PADS - 100))
     assert row["p95_rmse_kpa"] < 1e-4
+    row["calibrated_far_share"] = None
     names, (shown,) = tables.real({"real": [real.touches(made, given, UNUSED, UNUSED) | row]})
     assert len(names) == len(shown)
     assert shown[names.index("worst pad kPa")] == f"{row['worst_rmse_kpa']:.1f}"
     assert shown[names.index("off by 60 kPa")] == f"{row['far_share']:.2%}"
+
+
+def test_pads_that_are_valid_seldom_and_wrong_then_are_not_hidden(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are not usable, so the errors of usable pads say nothing of them."""
+    path = write(tmp_path, replace(recording(ramp()), name="left_calibration"))
+    play = real.play
+
+    def seldom(*given: object) -> PlayedCourse:
+        played = play(*given)  # type: ignore[arg-type]
+        played.valid[:] = True
+        played.valid[: int(0.9 * len(played.valid)), 7] = False
+        played.pressure_kpa[:, 7] += 500.0
+        return played
+
+    monkeypatch.setattr(real, "play", seldom)
+    row = real.measure(path, real.fit_pressures(path))
+    assert row["far_share"] < 1e-3
+    sweeps = len(ramp())
+    wrong = round(0.1 * sweeps) / ((PADS - 1 + 0.1) * sweeps)
+    assert row["calibrated_far_share"] - row["far_share"] == pytest.approx(wrong, rel=0.1)
+    names, (shown,) = tables.real({"real": [row]})
+    assert len(names) == len(shown)
+    place = names.index("off by 60 kPa, all calibrated")
+    assert shown[place] == f"{row['calibrated_far_share']:.2%}"
+    assert "`all calibrated`" in " ".join(page.real_skin(document_of(row)).text)
+
+
+def test_the_share_that_is_far_off_is_of_valid_readings_that_have_a_true_pressure() -> None:
+    made = UNLOADED
+    made = replace(made, pressure_kpa=made.pressure_kpa[:-100])
+    t, sweeps = len(made.t_ns), len(made.pressure_kpa)
+    given = course(made, np.append(made.pressure_kpa, np.full(100, 900.0)))
+    given.pressure_kpa[:10, 3] += 61.0
+    given.pressure_kpa[:10, 4] -= 61.0
+    given.pressure_kpa[:10, 5] += 59.0
+    given.valid[:5, 3] = False
+    assert t == sweeps + 100
+    four = np.isin(np.arange(PADS), [3, 4, 5, 6])
+    assert real.far_share(made, given, four) == pytest.approx(15 / (4 * sweeps - 5))
+    given.valid[:] = False
+    assert real.far_share(made, given, four) is None
 
 
 def test_one_json_document_has_a_row_for_each_recording(
@@ -261,6 +309,7 @@ def test_one_json_document_has_a_row_for_each_recording(
     assert row["pads_live"] == row["pads_usable"] == PADS
     assert row["touches_begun_10s"] == 0
     assert row["median_rmse_kpa"] is None
+    assert row["calibrated_far_share"] is None
     assert row["why_no_pressure"] == "left_calibration.npz is missing"
     assert "left_made_up" in (tmp_path / "o" / "real.md").read_text()
     assert "left_made_up" in (tmp_path / "o" / "real.html").read_text()
@@ -335,10 +384,17 @@ def test_what_is_no_recording_is_refused_in_one_line(
     assert "\n" not in str(error.value)
 
 
-def test_bytes_that_are_no_archive_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "bad.npz").write_bytes(b"not an archive")
-    with pytest.raises(LogError, match="wanted arrays"):
-        insole.read(tmp_path / "bad.npz")
+@pytest.mark.parametrize("content", [b"not an archive", b"", None], ids=["text", "none", "npy"])
+def test_bytes_that_are_no_archive_are_refused(content: bytes | None, tmp_path: Path) -> None:
+    """A single array was a traceback, and other bytes came with the advice to run them."""
+    path = tmp_path / "bad.npz"
+    if content is None:
+        np.save(tmp_path / "one.npy", np.zeros(3))
+        (tmp_path / "one.npy").rename(path)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(LogError, match="no archive of arrays; wanted arrays"):
+        insole.read(path)
 
 
 #: Errors of pressure that are larger than wanted; docs/accuracy.md shows what stands in the way.

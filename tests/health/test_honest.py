@@ -7,6 +7,7 @@ import pytest
 
 from emulator.probes.scene import Fault, Place, Probe, Scene
 from emulator.robot import Robot
+from skin_host.bus.ledger import MOST_OFTEN
 from skin_host.bus.wire import FrameBatch
 from skin_host.health import LATELY_NS, STALLED_NS, HealthWatch
 from skin_host.layout import PadKind
@@ -238,3 +239,33 @@ def test_what_pressed_as_a_board_took_its_zero_hides_no_fault_of_the_chip() -> N
     bench.run(1.0)
     assert ("board_in_doubt", "hand") in bench.told
     assert not {where for code, where in bench.told if "out_of_range" in code}
+
+
+def test_a_board_that_floods_its_bus_is_named_and_the_other_is_served() -> None:
+    """A chip has something new every 36.9 ms: nine sweeps a period tell no more than one."""
+    bench = FaultBench(3.0)
+    board, row = bench.layout.boards[1].name, bench.engine.ledger.row[1]
+    ledger = bench.engine.ledger
+    before = int(ledger.sweeps[row])
+    end = bench.inject("late_period", board=board, value=-44.5)
+    bench.run(8.0)
+    sent = int(ledger.sweeps[row]) - before
+    assert sent > 8.5 * 160
+    assert sent - ledger.excess[row] <= 200 + MOST_OFTEN * 160 + 1
+    assert ledger.excess[1 - row] == 0
+    assert set(bench.told) == {("board_period", board)}
+    part = next(
+        record
+        for record in bench.records.values()
+        if board in {one["name"] for one in record["boards"]}
+    )
+    assert part["state"] == "warning"
+    assert f"{ledger.excess[row]} of its sweeps" in " ".join(part["sentences"])
+    assert pads_of(bench, 0).all()
+    assert pads_of(bench, 1).all()
+    end()
+    bench.run(1.0)
+    excess = int(ledger.excess[row])
+    bench.run(65.0)
+    assert ledger.excess[row] == excess
+    assert not bench.told

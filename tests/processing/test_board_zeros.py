@@ -380,13 +380,47 @@ def test_a_touch_that_lasts_through_a_silence_is_felt_again_and_its_zero_in_no_d
     hand.send(20, p3=200)
     hand.pause(3.0)
     steps.clear()
-    hand.send(SWEEPS - 1, p3=200)
+    hand.send(2, p3=200)
     assert max(map(valid_share, steps)) == 0.0
-    hand.send(10, p3=200)
+    hand.send(SWEEPS + 7, p3=200)
     assert valid_share(steps[-1]) > 0.9
     assert steps[-1].frame.touched.sum() == 1
     assert hand.in_doubt == []
     assert hand.engine.ledger.rezeros.tolist() == [0]
+
+
+@pytest.mark.parametrize("lost", [5, 20])
+def test_lost_sweeps_under_a_touch_leave_three_without_valid_taxels(
+    worn: tuple[Hand, list[Step]], lost: int
+) -> None:
+    """A time-out of four periods, the first sweep after it, and two by which it is known."""
+    hand, steps = worn
+    hand.send(20, p3=200)
+    hand.skip(lost)
+    steps.clear()
+    hand.send(12, p3=200)
+    valid = [valid_share(step) > 0.9 for step in steps if step.frame.computed]
+    assert valid.index(True) <= 3
+    assert all(valid[3:])
+    assert not any(event.event == "end" for step in steps for event in step.events)
+    assert hand.in_doubt == []
+
+
+def test_a_touch_is_in_doubt_though_its_board_counted_as_clear_before_its_zero_showed(
+    worn: tuple[Hand, list[Step]],
+) -> None:
+    """Sweeps from before the zero had waited, and came as if they were new."""
+    hand, steps = worn
+    hand.send(20, p3=200)
+    hand.pause(3.0)
+    hand.send(3, p3=200)
+    hand.rests_elsewhere(seed=2)
+    hand.send(SWEEPS)
+    steps.clear()
+    hand.send(140)
+    assert 3 in hand.in_doubt
+    assert not any(step.frame.touched.any() for step in steps)
+    assert hand.engine.ledger.rezeros.tolist() == [1]
 
 
 def test_a_board_that_was_zeroed_unheard_gets_new_baselines(

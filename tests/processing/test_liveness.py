@@ -482,6 +482,84 @@ def test_presses_of_a_board_that_sends_seldom_are_neither_noise_nor_spikes() -> 
     assert not liveness.spikes.any()
 
 
+ONE = np.arange(K) == 1
+
+
+def without_one(liveness: Liveness, raw: np.ndarray, erring: bool = False) -> None:
+    """Take a sweep without the second triangle, whose status has an error or did not come."""
+    liveness.step(np.where(ONE[:, None], 0, raw).astype(np.uint8), ~ONE, ONE & erring)
+
+
+@pytest.mark.parametrize("every", [2, 3, 6])
+def test_a_triangle_that_is_lost_in_most_sweeps_shows_that_it_lives(every: int) -> None:
+    rng = np.random.default_rng(11)
+    centre = np.full((K, 12), 240.0)
+    liveness = calibrated(rng, 0.8, centre)
+    for sweep in range(4 * every):
+        raw = noisy_bytes(rng, 0.8, centre)
+        if sweep % every:
+            without_one(liveness, raw)
+        else:
+            liveness.step(raw, HERE, NO)
+    assert not liveness.unproven.any()
+
+
+@pytest.mark.parametrize("every", [1, 2, 3, 6])
+def test_a_triangle_that_dies_is_found_by_as_many_sweeps_if_others_are_lost(every: int) -> None:
+    rng = np.random.default_rng(12)
+    centre = np.full((K, 12), 240.0)
+    liveness = calibrated(rng, 0.8, centre)
+    for _ in range(10):
+        liveness.step(noisy_bytes(rng, 0.8, centre), HERE, NO)
+    for sweep in range(12 * every):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[ONE] = 240
+        if sweep % every:
+            without_one(liveness, raw)
+        else:
+            liveness.step(raw, HERE, NO)
+    assert liveness.frozen.tolist() == ONE.tolist()
+
+
+@pytest.mark.parametrize(("lost", "erring"), [(6, False), (1, True)])
+def test_bytes_before_many_lost_sweeps_or_an_error_are_not_compared(
+    lost: int, erring: bool
+) -> None:
+    """The chip may have restarted."""
+    liveness = Liveness(K, None, PERIOD_S)
+    for value in (240, 239, 238):
+        liveness.step(np.full((K, 12), value, np.uint8), HERE, NO)
+        for _ in range(lost):
+            without_one(liveness, np.full((K, 12), value, np.uint8), erring)
+    assert liveness.unproven.tolist() == ONE.tolist()
+
+
+def test_lost_sweeps_of_a_triangle_and_of_its_board_count_together() -> None:
+    liveness = Liveness(K, None, PERIOD_S)
+    for value in (240, 239, 238):
+        liveness.step(np.full((K, 12), value, np.uint8), HERE, NO)
+        for _ in range(3):
+            without_one(liveness, np.full((K, 12), value, np.uint8))
+        liveness.note_gap(0, 3)
+    assert liveness.unproven.tolist() == ONE.tolist()
+
+
+def test_presses_between_lost_sweeps_of_a_triangle_are_no_jumps() -> None:
+    """Pressed in every other of the sweeps that came, as by 5 Hz."""
+    rng = np.random.default_rng(13)
+    centre = np.full((K, 12), 240.0)
+    liveness = calibrated(rng, 0.5, centre)
+    for sweep in range(100):
+        raw = noisy_bytes(rng, 0.5, centre)
+        raw[ONE] -= np.uint8(30 * (sweep % 4 == 0))
+        if sweep % 2:
+            without_one(liveness, raw)
+        else:
+            liveness.step(raw, HERE, NO)
+        assert not liveness.noisy.any()
+    assert not liveness.spikes.any()
+
+
 def test_another_byte_after_a_long_silence_shows_no_life() -> None:
     """The board may have restarted meanwhile, and has another zero."""
     liveness = Liveness(K, np.full((K, 12), 0.8), PERIOD_S)

@@ -23,10 +23,12 @@ def look(scatter: Scatter, rows: np.ndarray, period_s: float = 0.05) -> list[int
     return scatter.look(rows, [period_s] * len(rows), rows.max(axis=0)).tolist()
 
 
-def found(kpa: np.ndarray, period_s: float, range_kpa: float = RANGE_KPA) -> set[int]:
+def found(
+    kpa: np.ndarray, period_s: float, range_kpa: float = RANGE_KPA, step_kpa: float = STEP_KPA
+) -> set[int]:
     """Which of the pads [t, m] are found at any time, looked at as the pipeline does."""
     m = kpa.shape[1]
-    scatter = Scatter(np.full(m, STEP_KPA, np.float32), np.full(m, range_kpa, np.float32))
+    scatter = Scatter(np.full(m, step_kpa, np.float32), np.full(m, range_kpa, np.float32))
     rows = kpa.astype(np.float32)
     pads: set[int] = set()
     for begin in range(0, len(rows) - 7, 8):
@@ -104,6 +106,44 @@ def test_a_pad_that_reads_another_value_with_each_conversion_is_found_at_any_rat
     kpa = 450.0 + 12.0 * UNIT_KPA * at / np.std(at)
     sent = read(kpa, sent_s) if period_s < CONVERSION_S else kpa
     assert found(sent, period_s) == set(range(PADS))
+
+
+@pytest.mark.parametrize("period_s", [0.05, 0.1])
+@pytest.mark.parametrize("step_kpa", [STEP_KPA, 2.5 * STEP_KPA])
+@given(seed=st.integers(0, 1000), opens=st.floats(0.02, 0.13), scatter=st.floats(0.65, 1.0))
+@settings(max_examples=10, deadline=None)
+def test_a_broken_contact_that_also_opens_now_and_then_is_found(
+    step_kpa: float, period_s: float, seed: int, opens: float, scatter: float
+):
+    """It falls to what a released pad reads, but more seldom than a hand would release."""
+    rng = np.random.default_rng(seed)
+    shape = (600, PADS)
+    levels = np.sqrt(2.0) * rng.choice([-1.0, 0.0, 0.0, 1.0], shape)
+    opened = rng.random(shape) < opens
+    kpa = step_kpa * (8.0 + scatter * levels)
+    kpa = np.where(opened, rng.uniform(0.0, 100.0, shape), kpa)
+    kpa += step_kpa / 6.0 * rng.normal(size=shape)
+    assert len(found(kpa, period_s, step_kpa=step_kpa)) >= PADS - 1
+
+
+@pytest.mark.parametrize("shape", ["half waves", "held"])
+@pytest.mark.parametrize("step_kpa", [STEP_KPA, 2.5 * STEP_KPA])
+@pytest.mark.parametrize("hz", [4.0, 5.1, 6.5, 8.0])
+def test_taps_that_last_longer_than_their_releases_are_no_scatter_at_ten_sweeps_a_second(
+    hz: float, step_kpa: float, shape: str
+):
+    """So seldom are they read that each reading shows another tap, or twice the same moment."""
+    t_s, rng = np.arange(600) * 0.1, np.random.default_rng(9)
+    phase = (t_s[:, np.newaxis] * hz + rng.uniform(size=PADS)) % 1.0
+    pressed = np.clip(phase / 0.65, 0.0, 1.0)
+    wave = (
+        np.sin(np.pi * pressed)
+        if shape == "half waves"
+        else 4.0 * np.minimum(pressed, 1.0 - pressed)
+    )
+    kpa = rng.uniform(300.0, 700.0, phase.shape) * np.clip(wave, 0.0, 1.0)
+    kpa += step_kpa / 6.0 * rng.normal(size=kpa.shape)
+    assert not found(kpa, 0.1, step_kpa=step_kpa)
 
 
 @pytest.mark.parametrize("period_s", PERIODS_S)

@@ -1,6 +1,7 @@
 """The daemon's recording of frames: each frame that came in its time is in the file, or counted."""
 
 import logging
+import os
 import resource
 import threading
 from collections.abc import Iterator
@@ -14,9 +15,9 @@ from skin_host.bus.logs import read_channels
 from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SteppedClock
-from skin_host.errors import RequestError
+from skin_host.errors import RequestError, StateError
 from skin_host.recording import capture
-from skin_host.recording.capture import FrameRecorder, candump_lines
+from skin_host.recording.capture import RESERVE_BYTES, FrameRecorder, candump_lines
 from tests.support.waiting import until
 
 Row = tuple[int, bytes, int]
@@ -56,6 +57,37 @@ async def test_what_a_full_disk_did_not_take_is_lost(tmp_path: Path, full_disk: 
     written = len(rows_of(tmp_path / "x.log"))
     assert 0 < written < 5000
     assert (recorder.frames, recorder.lost) == (written, 5000 - written)
+
+
+async def test_a_recording_leaves_room_for_what_the_daemon_keeps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk full of frames would not take what is touched, and a restart would not know it."""
+    disk = os.statvfs(tmp_path)
+    sizes = [disk.f_bavail * disk.f_frsize]
+
+    def seen(_: Path | int) -> os.statvfs_result:
+        values = list(disk)
+        values[1], values[4] = 1, max(sizes[0], 0)
+        return os.statvfs_result(values)
+
+    monkeypatch.setattr(capture.os, "statvfs", seen)
+    recorder = FrameRecorder(tmp_path / "x.log", 60.0, 10**9)
+    for _ in range(10):
+        recorder.put("can0", batch())
+    await until(lambda: recorder.frames == 1000)
+    sizes[0] = RESERVE_BYTES + 1000  # less than what comes next
+    recorder.put("can0", batch())
+    await until(lambda: recorder.ended is not None)
+    assert "less than 16 MiB of its disk are left" in (recorder.ended or "")
+    recorder.finish()
+    await recorder.finished()
+    assert (recorder.frames, recorder.lost) == (1000, 100)
+    assert len(rows_of(tmp_path / "x.log")) == 1000
+    sizes[0] = RESERVE_BYTES - 1
+    with pytest.raises(StateError, match="move recordings away"):
+        FrameRecorder(tmp_path / "y.log", 60.0, 10**9)
+    assert not (tmp_path / "y.log").exists()
 
 
 async def test_what_does_not_fit_in_its_size_is_lost(tmp_path: Path) -> None:

@@ -160,6 +160,17 @@ def test_an_interrupted_recording_gives_what_it_holds_and_then_its_damage(tmp_pa
     assert len(found) > 1000
 
 
+def test_two_recordings_one_after_the_other_are_not_the_first_alone(tmp_path: Path) -> None:
+    """As by `cat`: the second one was left out without a word."""
+    for name in ("a", "b"):
+        with Recorder(tmp_path / f"{name}.mcap") as recorder:
+            recorder.say(TOPIC, SECOND, b'{"state":"ok"}')
+    joined = tmp_path / "joined.mcap"
+    joined.write_bytes(b"".join((tmp_path / f"{name}.mcap").read_bytes() for name in "ab"))
+    with pytest.raises(LogError, match=r"goes on after its end.*`mcap merge`"):
+        list(read_messages_of(joined))
+
+
 @pytest.mark.parametrize("length", [2**31, 2**40, 2**63, 2**64 - 1])
 @pytest.mark.parametrize("opcode", [3, 5, 6, 9, 12, 0x80])
 def test_a_record_that_states_to_be_huge_is_refused(

@@ -148,9 +148,24 @@ def test_a_recording_of_a_bus_on_which_nothing_came_has_failed(
     told = capsys.readouterr()
     (line,) = told.err.splitlines()
     assert f"no CAN frame came on the buses of {config}" in line
-    # What there is of it is kept, and said.
-    assert json.loads(told.out)["file"] == file
-    assert Path(file).exists()
+    assert told.out == ""
+    # The next attempt finds no file in its way.
+    assert not any(tmp_path.iterdir())
+
+
+def test_frames_that_are_played_where_nobody_is_are_no_success_without_a_word(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, config = write_log(tmp_path / "a.log", 3, lambda _: ()), tmp_path / "skin.toml"
+    write_config(config)
+    text = config.read_text()
+    config.write_text(text.replace('channel = "can0"', 'channel = "can0"\ninterface = "virtual"'))
+    assert main(["replay", str(log), "--config", str(config), "--onto", "can"]) == 0
+    told = capsys.readouterr()
+    assert told.out.endswith("frames played\n")
+    (line,) = told.err.splitlines()
+    assert line.startswith("warning: bus ")
+    assert "no other program is on it" in line
 
 
 async def test_a_robot_is_recorded_until_ctrl_c_and_played_again(

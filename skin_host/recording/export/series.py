@@ -31,6 +31,7 @@ from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.export.columns import TABLES
+from skin_host.recording.export.known import ContactLine, Gone, Known
 from skin_host.recording.mcap import read_messages_of, robot_at
 from skin_host.recording.replay import contacts_of, replay
 
@@ -72,14 +73,6 @@ class HealthLine(NamedTuple):
     text: str
 
 
-class ContactLine(NamedTuple):
-    """Contact state of a part, from this time on."""
-
-    part: str
-    t_ns: int
-    state: ContactState
-
-
 @dataclass(frozen=True, slots=True)
 class Series:
     """A whole recording.
@@ -92,6 +85,8 @@ class Series:
         slips, overs: of fingertips, in their order.
         contacts: changes in their order; of a recording of CAN frames, those of parts with skin.
         fingertips: those on force/torque boards, as far as the recording describes them.
+        gone: when parts were not received any more; of a recording of CAN frames none, as its
+            frames and touches show it.
     """
 
     parts: dict[str, PartSeries]
@@ -102,6 +97,7 @@ class Series:
     overs: list[Over] = field(default_factory=list)
     contacts: list[ContactLine] = field(default_factory=list)
     fingertips: dict[str, FingertipInfo] = field(default_factory=dict)
+    gone: list[Gone] = field(default_factory=list)
 
     def take(self, event: FingertipEvent) -> None:
         """Add an event."""
@@ -168,7 +164,7 @@ def read_messages(recording: Path) -> Series:
     found = Series({}, [], {})
     repeats = SentTwice()
     health: dict[str, HealthLine] = {}
-    contacts: dict[str, ContactLine] = {}
+    known = Known()
     for said in read_messages_of(recording):
         words = said.topic.split("/")
         name, kind = words[-2:]
@@ -188,16 +184,19 @@ def read_messages(recording: Path) -> Series:
                         f"{len(frame.valid)} taxels; export the recordings of one skin"
                     )
                 growing.add(frame)
+                known.sign(name, said.t_ns, frame.t_ns)
             elif kind in EVENT_DECODERS:
                 event = EVENT_DECODERS[kind](said.payload)
                 if not repeats.has(event):
                     found.take(event)
+                    if isinstance(event, Touch):
+                        known.touch(event, said.t_ns)
             elif kind == "contact" and said.payload:
-                state = ContactLine(name, said.t_ns, decode_contact(said.payload))
-                if name not in contacts or contacts[name].state != state.state:
-                    contacts[name] = state
-                    found.contacts.append(state)
+                known.state(name, decode_contact(said.payload), said.t_ns)
+            elif kind == "status":
+                known.status(name, said.payload, said.t_ns)
             elif kind == "health" and said.payload:
+                known.sign(name, said.t_ns)
                 line = health_line(name, said.t_ns, decode_health(said.payload))
                 if name not in health or health[name]._replace(t_ns=said.t_ns) != line:
                     health[name] = line
@@ -206,9 +205,12 @@ def read_messages(recording: Path) -> Series:
                 info = decode_info(said.payload)
                 found.shapes.update(info.parts)
                 found.fingertips.update(info.fingertips)
+                known.info(name, [*info.parts, *info.fingertips], said.t_ns)
         except MessageError as error:
             raise LogError(f"{recording}: {said.topic}: {error}") from None
     found.parts.update((name, part.series(name)) for name, part in parts.items())
+    found.contacts.extend(known.contacts)
+    found.gone.extend(known.gone)
     if not found.parts and not found.contents():
         raise LogError(
             f"{recording}: holds no frames of pressure, events, contact states or health of a robot"
