@@ -326,7 +326,10 @@ def test_python_cans_socketcan_under_another_name_is_read_in_batches():
     [
         (Bus(channel="nowhere7"), "no such network interface .*ip link add dev nowhere7 type vcan"),
         (Bus(channel="lo"), "not a CAN interface"),
-        (Bus(interface="slcan", channel="/dev/none"), "slcan /dev/none: cannot be opened"),
+        (
+            Bus(interface="udp_multicast", channel="10.0.0.1"),
+            "udp_multicast 10.0.0.1: cannot be opened",
+        ),
     ],
 )
 def test_what_cannot_be_opened_is_one_line_with_its_name(bus, says, monkeypatch):
