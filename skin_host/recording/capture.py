@@ -57,6 +57,8 @@ WAITING_BATCHES = 4096
 MAX_RECORDINGS = 100
 #: So much of a disk is left to what the daemon keeps there, as whether something is touched.
 RESERVE_BYTES = 16 * 1024**2
+#: A recording begins only where it may take this beside: else it would be an empty file.
+LEAST_BYTES = 64 * 1024
 #: A disk that needs longer than this is no longer waited for.
 PATIENCE_S = 1.0
 #: A recording looks this often whether its time is over.
@@ -421,7 +423,7 @@ class FrameRecorder:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             _check_room(path.parent, "*")
-            if (full := _full(path.parent)) is not None:
+            if (full := _full(path.parent, LEAST_BYTES)) is not None:
                 raise StateError(f"{path.parent}: {full}; move recordings away")
             try:
                 file = path.open("xb", buffering=0)

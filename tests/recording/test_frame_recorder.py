@@ -84,7 +84,7 @@ async def test_a_recording_leaves_room_for_what_the_daemon_keeps(
     await recorder.finished()
     assert (recorder.frames, recorder.lost) == (1000, 100)
     assert len(rows_of(tmp_path / "x.log")) == 1000
-    sizes[0] = RESERVE_BYTES - 1
+    sizes[0] = RESERVE_BYTES + 1000  # it would hold nothing
     with pytest.raises(StateError, match="move recordings away"):
         FrameRecorder(tmp_path / "y.log", 60.0, 10**9)
     assert not (tmp_path / "y.log").exists()

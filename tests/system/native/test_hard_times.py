@@ -136,8 +136,8 @@ async def test_a_full_disk_is_told_and_costs_nothing_but_what_it_cannot_hold(
         path = small_disk / "recordings" / "run.log"
         assert path.read_bytes().endswith(b"\n")
         assert sum(len(batch) for _, batch in read_channels(path)) == answer["frames"] > 100
-        with pytest.raises(Exception, match=r"is there already|move recordings away"):
-            await daemon.control.handle("record", b'{"file":"run.log"}')
+        with pytest.raises(Exception, match="move recordings away"):
+            await daemon.control.handle("record", b'{"file":"more.log"}')
         answer = await daemon.control.handle("thresholds", b'{"set":{"margin_units":6}}')
         assert answer["kept"] is True
         await sweeps_go_on(daemon)
