@@ -288,7 +288,8 @@ class TouchDetector:
             raw: uint8[n]; must not be written to afterwards.
             dt_s: time since the sweep before.
             unheard: bool[n], taxels that were not received: their evidence does not change until
-                they are lost.
+                they are lost. That of untouched ones is forgotten then: what is received now and
+                then only may be received because of what it reads, and is no lasting change.
         """
         if self._skipped:
             self._skipped = False
@@ -305,7 +306,13 @@ class TouchDetector:
             self._unheard_s += np.float32(dt_s)
             self._unheard_s[~unheard] = 0.0
             self._is_unheard = True
-            self.lose(self.touched & (self._unheard_s > LOST_S))
+            lost = self._unheard_s > LOST_S
+            if any_of(lost):
+                self.lose(self.touched & lost)
+                forgotten = lost & ~self.touched
+                if self.lost is not None:
+                    forgotten &= ~self.lost
+                evidence[forgotten] = 0.0
         elif self._is_unheard:
             self._unheard_s.fill(0.0)
             self._is_unheard = False

@@ -56,6 +56,19 @@ def flags(*numbers):
     return [bool(number) for number in numbers]
 
 
+@pytest.mark.parametrize(("gap_s", "touched"), [(0.8 * LOST_S, True), (1.2 * LOST_S, False)])
+def test_what_an_untouched_taxel_read_before_it_was_lost_is_no_evidence(gap_s, touched):
+    """It may be received now and then only because of what it reads: then noise is a touch."""
+    detector = detector_of()
+    pressed(detector, 2)
+    raw = np.full(1, REST, np.uint8)
+    for _ in range(round(gap_s / SWEEP_S)):
+        detector.step(raw, SWEEP_S, np.array([True]))
+    assert not detector.touched[0]
+    assert bool(pressed(detector, 2)[0]) is touched
+    assert pressed(detector, 2)[0]
+
+
 def test_a_touch_ends_when_its_taxel_is_lost_for_long_at_a_time_and_not_now_and_then():
     detector = detector_of()
     raw = np.full(1, REST - 50, np.uint8)
