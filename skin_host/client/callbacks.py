@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, Literal, Self, TypeVar
 
 from skin_host.client.heard import Described, Health
-from skin_host.client.presence import Contact
+from skin_host.client.presence import STALE_S, Contact
 from skin_host.client.session import SkinClient
 from skin_host.client.streams import Stream
 from skin_host.errors import RequestError, SkinError
@@ -53,7 +53,7 @@ class SkinCallbacks:
         base: str | None = None,
         protocol: Literal["5", "3.1.1"] = "5",
         patience_s: float = 10.0,
-        stale_s: float = 3.0,
+        stale_s: float = STALE_S,
     ) -> None:
         self._make = partial(
             SkinClient,

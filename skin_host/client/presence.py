@@ -40,6 +40,8 @@ class Contact(NamedTuple):
         return self.state != "OFF"
 
 
+#: A part of which nothing came for this long is UNKNOWN, unless somebody asks for another time.
+STALE_S = 3.0
 #: At most this many touches of a part are kept, of this many taxels together: of more, the oldest
 #: are forgotten.
 MAX_TOUCHES = 1000

@@ -16,7 +16,7 @@ from skin_host.client.absent import no_such_part, unpublished
 from skin_host.client.heard import Described, Health, is_online, read
 from skin_host.client.links import RETAINED_S, ROBOT_S, BrokerLink, only_robot, refusal
 from skin_host.client.order import EventOrder, Newest
-from skin_host.client.presence import Contact, Presence
+from skin_host.client.presence import STALE_S, Contact, Presence
 from skin_host.client.streams import Kind, Stream, refuse_other_loop
 from skin_host.errors import BrokerError, RequestError, SkinError, visible
 from skin_host.fingertip.events import Over, Slip
@@ -157,7 +157,7 @@ class SkinClient:
         base: str | None = None,
         protocol: Literal["5", "3.1.1"] = "5",
         patience_s: float = 10.0,
-        stale_s: float = 3.0,
+        stale_s: float = STALE_S,
     ) -> None:
         brokers: list[Broker] = []
         for one in [broker] if isinstance(broker, str | Broker) else broker:

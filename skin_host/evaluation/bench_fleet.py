@@ -38,7 +38,7 @@ import numpy as np
 from skin_host.client.heard import is_online
 from skin_host.client.links import BrokerLink
 from skin_host.client.order import EventOrder, Newest
-from skin_host.client.presence import Presence
+from skin_host.client.presence import STALE_S, Presence
 from skin_host.client.session import HOLD_S
 from skin_host.config.settings import Mqtt
 from skin_host.errors import RequestError
@@ -57,7 +57,6 @@ TRAFFIC = Path(__file__).parent / "fleet_traffic.jsonl"
 BASE = "skin"
 PART = "left_hand"
 NODE = "main"
-STALE_S = 3.0
 #: A client's state may lag by this much.
 ALLOWED_S = 5.0
 DRAIN_S = 30.0

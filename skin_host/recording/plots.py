@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.client.presence import STALE_S
 from skin_host.errors import RequestError, required
 from skin_host.files import write_atomic, writing
 from skin_host.layout import Layout, PadKind
@@ -16,7 +17,6 @@ from skin_host.processing.calibration import Calibration, Verdict
 from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict
 from skin_host.processing.events import Touch
 from skin_host.recording.export import PartSeries, Series
-from skin_host.recording.export.known import STALE_S
 
 Floats = NDArray[np.float64]
 

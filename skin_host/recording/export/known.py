@@ -7,12 +7,10 @@ its parts would look as if they lasted until the same part is received again.
 from typing import NamedTuple
 
 from skin_host.client.heard import is_online
-from skin_host.client.presence import Presence
+from skin_host.client.presence import STALE_S, Presence
 from skin_host.mqtt.messages import ContactState
 from skin_host.processing.events import Touch
 
-#: A part of which nothing came for this long is not known, as by default for a client.
-STALE_S = 3.0
 #: It is looked this often whether a part is still known while others are received.
 LOOK_NS = 500_000_000
 
