@@ -48,6 +48,7 @@ from skin_host.untrusted import from_json
 
 T = TypeVar("T", bound=Struct)
 TRIANGLES_PER_BOARD = 16
+LAST_PORT = 65535
 #: A rate of 0 lets everything pass; another one is at least this.
 LEAST_HZ = 0.001
 
@@ -225,7 +226,7 @@ class Mqtt(_Table, frozen=True):
     """The broker. The password is never stored here: it is read from a file or credential."""
 
     host: Printable = "localhost"
-    port: Annotated[int, Meta(ge=1, le=65535)] = 1883
+    port: Annotated[int, Meta(ge=1, le=LAST_PORT)] = 1883
     #: Instead of `host`: nodes of a cluster or independent brokers, as "host" or "host:port".
     brokers: Annotated[list[Address], Meta(max_length=16)] = []
     protocol: Literal["5", "3.1.1"] = "5"
@@ -265,7 +266,7 @@ class Service(_Table, frozen=True):
     #: $STATE_DIRECTORY, otherwise XDG state.
     state_directory: Printable | None = None
     #: Prometheus text on this port of localhost; 0 is off.
-    metrics_port: Annotated[int, Meta(ge=0, le=65535)] = 0
+    metrics_port: Annotated[int, Meta(ge=0, le=LAST_PORT)] = 0
 
 
 class Settings(_Table, frozen=True):

@@ -20,7 +20,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from skin_host.config.settings import Settings, changed, parse_triangles
+from skin_host.config.settings import LAST_PORT, Settings, changed, parse_triangles
 from skin_host.daemon import service
 from skin_host.errors import RequestError
 from skin_host.processes import kept_from_children
@@ -28,7 +28,6 @@ from skin_host.processes import kept_from_children
 #: Daemons end touches, stop boards and disconnect within this time; systemd waits as long for all.
 STOP_S = 4.5
 _NOTIFICATION_BYTES = 4096
-LAST_PORT = 65535
 
 
 class Merged:

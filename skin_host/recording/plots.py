@@ -262,8 +262,7 @@ def _broken(series: Series, part: PartSeries, taxels: list[int]) -> tuple[Floats
 
 def _ends(series: Series, part: PartSeries) -> NDArray[np.bool_]:
     """Return after which frames of a part [n - 1] nothing was known of it for a while."""
-    gone_ns = [gone.t_ns for gone in series.gone if gone.part == part.name]
-    known = np.searchsorted(np.sort(gone_ns), part.t_ns)
+    known = np.searchsorted(np.sort(series.gone_ns(part.name)), part.t_ns)
     steps_ns = np.diff(part.t_ns)
     # Frames may be thinned to any rate.
     usual_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
@@ -277,7 +276,7 @@ def _contacts(series: Series, part: PartSeries) -> list[tuple[float, float]]:
     spans = []
     known_s = 0.0
     gone: list[tuple[int, Touch | None]]
-    gone = [(one.t_ns, None) for one in series.gone if one.part == part.name]
+    gone = [(t_ns, None) for t_ns in series.gone_ns(part.name)]
     touches = [(one.t_ns, one) for one in series.touches if one.part == part.name]
     for t_ns, touch in merge(gone, touches, key=lambda one: one[0]):
         at_s = (t_ns - int(part.t_ns[0])) * 1e-9

@@ -1,13 +1,14 @@
 """One run: storms of troubles and touches, each followed by a calm in which all must be well."""
 
 import asyncio
+import contextlib
 import logging
 import os
 import random
 import tempfile
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
@@ -562,31 +563,37 @@ class _Run:
             for spot in [*self.world.spots, *self.world.tips]:
                 group.create_task(spot.press(seconds, self._staging.uniform(*FIRM_KPA)))
 
+    @contextlib.asynccontextmanager
+    async def _in_a_press(
+        self, seconds: float, least_s: float, most_s: float
+    ) -> AsyncIterator[None]:
+        """Press every place firmly for a while; begin when it has lasted a drawn time, and end with
+        it.
+        """
+        pressing = asyncio.create_task(self._press_all(seconds), name="press all")
+        await self.world.clock.sleep(self._staging.uniform(least_s, most_s))
+        yield
+        await pressing
+
     async def _reset_in_a_press(self) -> None:
         """A board restarts while it is pressed; the daemon brings it back by itself."""
-        pressing = asyncio.create_task(self._press_all(8.0), name="press all")
-        await self.world.clock.sleep(self._staging.uniform(1.0, 2.0))
-        self._inject("board_reset", self._staging)
-        await pressing
+        async with self._in_a_press(8.0, 1.0, 2.0):
+            self._inject("board_reset", self._staging)
         await self.world.clock.sleep(BACK_NS / 1e9)
 
     async def _set_up_in_a_press(self) -> None:
         """An operator sets boards up while they are pressed."""
-        pressing = asyncio.create_task(self._press_all(8.0), name="press all")
-        await self.world.clock.sleep(self._staging.uniform(1.0, 2.0))
-        board = self._staging.choice(self.world.layout.boards).name
-        self._ask("configure", self._staging.choice(("{}", f'{{"board": "{board}"}}')))
-        await pressing
+        async with self._in_a_press(8.0, 1.0, 2.0):
+            board = self._staging.choice(self.world.layout.boards).name
+            self._ask("configure", self._staging.choice(("{}", f'{{"board": "{board}"}}')))
 
     async def _lose_broker_in_presses(self) -> None:
         """The broker fails while the skin is pressed again and again, and then is well again."""
         kinds = ("broker_absent", "broker_frozen", "broker_refuses", "broker_disconnects")
-        pressing = asyncio.create_task(self._press_all(1.0), name="press all")
-        await self.world.clock.sleep(self._staging.uniform(0.5, 1.0))
-        trouble = self._inject(self._staging.choice(kinds), self._staging)
-        assert trouble is not None
-        lasting = asyncio.create_task(self._last(trouble, 8.0 if trouble.lasts_s[1] else 0.0))
-        await pressing
+        async with self._in_a_press(1.0, 0.5, 1.0):
+            trouble = self._inject(self._staging.choice(kinds), self._staging)
+            assert trouble is not None
+            lasting = asyncio.create_task(self._last(trouble, 8.0 if trouble.lasts_s[1] else 0.0))
         for _ in range(4):
             await self.world.clock.sleep(0.5)
             await self._press_all(1.0)
@@ -609,10 +616,8 @@ class _Run:
 
     async def _obey_another_host_in_a_press(self) -> None:
         """Another program on the bus sets a board up while it is pressed."""
-        pressing = asyncio.create_task(self._press_all(8.0), name="press all")
-        await self.world.clock.sleep(self._staging.uniform(1.0, 2.0))
-        self._inject("other_host", self._staging)
-        await pressing
+        async with self._in_a_press(8.0, 1.0, 2.0):
+            self._inject("other_host", self._staging)
         await self.world.clock.sleep(BACK_NS / 1e9)
 
     async def _lose_all_power_in_a_press(self) -> None:
@@ -620,21 +625,19 @@ class _Run:
         pressed before and still is does not read as untouched afterwards.
         """
         clock = self.world.clock
-        pressing = asyncio.create_task(self._press_all(16.0), name="press all")
-        await clock.sleep(self._staging.uniform(5.0, 7.0))
-        held = self._parts_with_contact(b"ON")
-        self.result.deaths += 1
-        self._kill(power=True)
-        for board in self.world.layout.boards:
-            self._promises.begin(act("power"))
-            self.world.robot.inject(Fault(name="board_reset", board=board.name))
-        await clock.sleep(self._staging.uniform(0.1, 2.0))
-        self._start()
-        while any(spot.pressed for spot in self.world.spots):
-            for part in held & self._parts_with_contact(b"OFF"):
-                self._promises.break_(f"{part}: OFF after a power failure, and still pressed")
-            await clock.sleep(0.1)
-        await pressing
+        async with self._in_a_press(16.0, 5.0, 7.0):
+            held = self._parts_with_contact(b"ON")
+            self.result.deaths += 1
+            self._kill(power=True)
+            for board in self.world.layout.boards:
+                self._promises.begin(act("power"))
+                self.world.robot.inject(Fault(name="board_reset", board=board.name))
+            await clock.sleep(self._staging.uniform(0.1, 2.0))
+            self._start()
+            while any(spot.pressed for spot in self.world.spots):
+                for part in held & self._parts_with_contact(b"OFF"):
+                    self._promises.break_(f"{part}: OFF after a power failure, and still pressed")
+                await clock.sleep(0.1)
         await clock.sleep(BACK_NS / 1e9)
 
     def _parts_with_contact(self, state: bytes) -> set[str]:

@@ -231,21 +231,18 @@ class RecordedScene:
             yield self.scene.points(name, t_ns, kpa, beyond_range)
 
     def _unknown(self, name: str) -> Iterator[Item]:
-        for t_ns in self._gone_ns(name):
+        for t_ns in self._series.gone_ns(name):
             yield self.scene.unknown(name, t_ns)
 
     def _arrows(self, name: str) -> Iterator[Item]:
         mine = (touch for touch in self._series.touches if touch.part == name)
-        gone_ns = self._gone_ns(name)
+        gone_ns = self._series.gone_ns(name)
         for t_ns, touches in groupby(mine, key=lambda touch: touch.t_ns):
             while gone_ns and gone_ns[0] <= t_ns:
                 yield self.scene.untouched(name, gone_ns.pop(0))
             yield self.scene.arrows(name, t_ns, touches)
         for last_ns in gone_ns:
             yield self.scene.untouched(name, last_ns)
-
-    def _gone_ns(self, name: str) -> list[int]:
-        return [gone.t_ns for gone in self._series.gone if gone.part == name]
 
 
 def _arrow(touch: Touch) -> Arrow | None:

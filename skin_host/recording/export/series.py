@@ -99,6 +99,10 @@ class Series:
     fingertips: dict[str, FingertipInfo] = field(default_factory=dict)
     gone: list[Gone] = field(default_factory=list)
 
+    def gone_ns(self, part: str) -> list[int]:
+        """Return when a part was not received any more."""
+        return [gone.t_ns for gone in self.gone if gone.part == part]
+
     def take(self, event: FingertipEvent) -> None:
         """Add an event."""
         if isinstance(event, Touch):
