@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import can
 
@@ -36,17 +37,29 @@ CONFIG = ROOT / "config" / "demo.toml"
 _numbers = itertools.count()
 
 
+#: 60 kPa below a finger of 10 mm.
+FORCE_N = 4.7
+
+
+def _finger(**scripted: Any) -> Probe:
+    return Probe(part="left_hand", at=Place(triangle=4), diameter_mm=10, **scripted)
+
+
 def pressed_from(start_s: float) -> Scene:
     """A finger presses the thumb, again and again."""
-    press = Probe(
-        part="left_hand",
-        at=Place(triangle=4),
-        diameter_mm=10,
-        pressure_kpa=[(0, 0), (0.1, 60), (0.5, 60), (0.6, 0)],
-        start_s=start_s,
-        repeat_s=1,
-    )
+    course = [(0.0, 0.0), (0.1, 60.0), (0.5, 60.0), (0.6, 0.0)]
+    press = _finger(pressure_kpa=course, start_s=start_s, repeat_s=1)
     return Scene(quiet=True, probe=[press])
+
+
+async def _press(robot: Robot) -> None:
+    """The finger presses again and again from now on, when the skin is calibrated."""
+    finger = robot.touch(_finger())
+    while True:
+        finger.press(FORCE_N)
+        await asyncio.sleep(0.5)
+        finger.lift()
+        await asyncio.sleep(0.5)
 
 
 class World:
@@ -154,10 +167,11 @@ class World:
                 Bus(interface="virtual", channel=self.channel("robot")),
                 self.state,
                 port=int(self.broker.rpartition(":")[2]),
-                scene=pressed_from(6.0),
                 config=self.robot,
-            ):
+            ) as live:
+                finger = asyncio.create_task(_press(live.robot))
                 ready.set()
                 await end.wait()
-            body.cancel()
-            await asyncio.gather(body, return_exceptions=True)
+            for task in (body, finger):
+                task.cancel()
+            await asyncio.gather(body, finger, return_exceptions=True)
