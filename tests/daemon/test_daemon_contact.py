@@ -11,7 +11,7 @@ from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
 from skin_host.mqtt.messages import ContactState
 from tests.support.broker import Mosquitto
-from tests.support.live import Live, living
+from tests.support.live import FINGER_N, Live, living
 from tests.support.stepped import stepped
 from tests.support.subscriber import Subscriber
 
@@ -23,17 +23,6 @@ async def subscriber(mosquitto: Mosquitto) -> AsyncIterator[Subscriber]:
     listening.close()
 
 
-def touched_scene() -> Scene:
-    press = Probe(
-        part="left_hand",
-        at=Place(triangle=4),
-        diameter_mm=10,
-        pressure_kpa=[(0, 0), (0.1, 60), (1000, 60)],
-        start_s=4.0,
-    )
-    return Scene(probe=[press], quiet=True)
-
-
 async def until_contact(live: Live, subscriber: Subscriber, part: str, state: bytes) -> None:
     await live.wait(lambda: subscriber.payloads(f"{part}/contact")[-1:] == [state])
 
@@ -41,9 +30,8 @@ async def until_contact(live: Live, subscriber: Subscriber, part: str, state: by
 async def test_a_board_that_dies_during_a_touch_never_looks_untouched(
     can_bus_settings: Bus, tmp_path: Path, mosquitto: Mosquitto, subscriber: Subscriber
 ) -> None:
-    async with living(
-        can_bus_settings, tmp_path, port=mosquitto.port, scene=touched_scene()
-    ) as live:
+    async with living(can_bus_settings, tmp_path, port=mosquitto.port) as live:
+        live.finger().press(FINGER_N)
         await until_contact(live, subscriber, "left_hand", b"ON")
         live.robot.inject(Fault(name="board_silent", board="hand"))
         await until_contact(live, subscriber, "left_hand", b"UNKNOWN")
@@ -118,9 +106,8 @@ async def test_after_a_restart_a_silent_board_is_unknown_whatever_the_broker_kep
 async def test_a_touch_that_lasts_at_the_end_is_stopped_not_released(
     can_bus_settings: Bus, tmp_path: Path, mosquitto: Mosquitto, subscriber: Subscriber
 ) -> None:
-    async with living(
-        can_bus_settings, tmp_path, port=mosquitto.port, scene=touched_scene()
-    ) as live:
+    async with living(can_bus_settings, tmp_path, port=mosquitto.port) as live:
+        live.finger().press(FINGER_N)
         await until_contact(live, subscriber, "left_hand", b"ON")
     await live.wait(lambda: subscriber.payloads("main/status")[-1:] == [b"offline"])
     assert subscriber.documents("left_hand/touch")[-1]["reason"] == "stopped"

@@ -9,8 +9,8 @@ from pathlib import Path
 import can
 
 from emulator.clock import RealClock
-from emulator.probes.scene import Fault, Scene
-from emulator.robot import Robot
+from emulator.probes.scene import Fault, Place, Probe, Scene
+from emulator.robot import LiveProbe, Robot
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, changed, load
 from skin_host.daemon.daemon import Daemon
@@ -20,6 +20,8 @@ from tests.support.waiting import PATIENCE_S
 #: How often health is looked at: a look makes that of all parts.
 HEALTH_S = 0.1
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+#: 60 kPa below a finger.
+FINGER_N = 4.7
 
 
 class Live:
@@ -30,6 +32,10 @@ class Live:
         self.daemon = daemon
         #: Frames that the robot has put on each bus.
         self.frames_sent = frames_sent
+
+    def finger(self) -> LiveProbe:
+        """A finger over the thumb; what presses at a time of its own may press a calibration."""
+        return self.robot.touch(Probe(part="left_hand", at=Place(triangle=4), diameter_mm=10))
 
     def faults(self) -> set[tuple[str, str]]:
         """What is told now, by code and place."""

@@ -10,7 +10,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import can
 
@@ -28,7 +27,7 @@ from skin_host.recording.capture import CanLog
 from skin_host.recording.mcap import Recorder
 from skin_host.recording.replay import calibrate_from_log, read_buses
 from tests.support.broker import Mosquitto
-from tests.support.live import living
+from tests.support.live import FINGER_N, Live, living
 from tests.support.pages import ROOT
 from tests.support.waiting import PATIENCE_S
 
@@ -37,26 +36,24 @@ CONFIG = ROOT / "config" / "demo.toml"
 _numbers = itertools.count()
 
 
-#: 60 kPa below a finger of 10 mm.
-FORCE_N = 4.7
-
-
-def _finger(**scripted: Any) -> Probe:
-    return Probe(part="left_hand", at=Place(triangle=4), diameter_mm=10, **scripted)
-
-
 def pressed_from(start_s: float) -> Scene:
     """A finger presses the thumb, again and again."""
-    course = [(0.0, 0.0), (0.1, 60.0), (0.5, 60.0), (0.6, 0.0)]
-    press = _finger(pressure_kpa=course, start_s=start_s, repeat_s=1)
+    press = Probe(
+        part="left_hand",
+        at=Place(triangle=4),
+        diameter_mm=10,
+        pressure_kpa=[(0, 0), (0.1, 60), (0.5, 60), (0.6, 0)],
+        start_s=start_s,
+        repeat_s=1,
+    )
     return Scene(quiet=True, probe=[press])
 
 
-async def _press(robot: Robot) -> None:
-    """The finger presses again and again from now on, when the skin is calibrated."""
-    finger = robot.touch(_finger())
+async def _press(live: Live) -> None:
+    """A finger presses again and again from now on, when the skin is calibrated."""
+    finger = live.finger()
     while True:
-        finger.press(FORCE_N)
+        finger.press(FINGER_N)
         await asyncio.sleep(0.5)
         finger.lift()
         await asyncio.sleep(0.5)
@@ -169,7 +166,7 @@ class World:
                 port=int(self.broker.rpartition(":")[2]),
                 config=self.robot,
             ) as live:
-                finger = asyncio.create_task(_press(live.robot))
+                finger = asyncio.create_task(_press(live))
                 ready.set()
                 await end.wait()
             for task in (body, finger):
