@@ -38,6 +38,10 @@ LIFTED_PADS = 2
 #: One such pad is enough while `FAR_PADS` pads are far out of range. That many far pads are enough
 #: alone where "far" is more than this multiple of the capacitance at which the pressure curve ends.
 FAR_SHARE = 1.5
+#: A triangle that reads like another chip's twice within this time, or within this many periods,
+#: stays so until it has not for as long: which of its sweeps show it is up to noise.
+AGAIN_NS = 1_000_000_000
+AGAIN_PERIODS = 10
 
 
 class PartSample(NamedTuple):
@@ -144,6 +148,15 @@ class Intake:
         #: veto, others were made.
         self._last: list[tuple[Mask, Mask] | None] = [None] * n
         self._vetoed: dict[int, tuple[tuple[Mask, Mask], bytes, tuple[Mask, Mask]]] = {}
+        #: When each triangle read like another chip's last, and until when its readings are not
+        #: taken for that, on the ledger's clock; by row the last of these.
+        self._another_ns = np.full((n, TRIANGLES), -1 << 60, np.int64)
+        self._untaken_ns = self._another_ns.copy()
+        self._until_ns = [0] * n
+        periods_ms = [layout.boards[board].settings.period_ms for board in boards]
+        self._again_ns = [
+            max(AGAIN_NS, AGAIN_PERIODS * 1_000_000 * period_ms) for period_ms in periods_ms
+        ]
         # What is not judged yet.
         self._waiting = np.zeros(n, np.bool_)
         self._n_waiting = 0
@@ -189,6 +202,8 @@ class Intake:
         for row in np.flatnonzero(boards).tolist():
             self.veto.pop(row, None)
             self.far_presses.forget(row)
+            self._untaken_ns[row] = self._another_ns[row] = -1 << 60
+            self._until_ns[row] = 0
 
     def go_on(self, before: "Intake") -> None:
         """Take over the state of a predecessor for the same boards."""
@@ -201,6 +216,8 @@ class Intake:
         self._raw, self._bytes = before._raw, before._bytes
         self._present, self._received = before._present, before._received
         self._masks, self._usual, self._here = before._masks, before._usual, before._here
+        self._another_ns, self._untaken_ns = before._another_ns, before._untaken_ns
+        self._until_ns = before._until_ns
         self._states, self._of_board = before._states, before._of_board
         self._waits = before._waits
 
@@ -314,7 +331,7 @@ class Intake:
             self._usual[row] = None
             self.far_presses.forget(row)
             masks = self._nothing
-        elif ledger.flagged[row]:
+        elif ledger.flagged[row] or ledger.now_ns < self._until_ns[row]:
             pressed = self._pressed_far(row, sweep)
             here = self._flagged(row, sweep.raw, pressed)
             # A copy: it may be judged after the ledger has noted the next sweep.
@@ -405,9 +422,18 @@ class Intake:
         """
         ledger = self._ledger
         far = ledger.far[row]
-        here: Mask = ledger.present[row] & (ledger.error[row] == 0) & ~lifted(raw, far)
+        another = lifted(raw, far)
         if any_of(self._unpressable[row]):
-            here &= ~(self._unpressable[row] & (count_of(far & ~pressed) >= FAR_PADS))
+            another |= self._unpressable[row] & (count_of(far & ~pressed) >= FAR_PADS)
+        here: Mask = ledger.present[row] & (ledger.error[row] == 0)
+        another &= here
+        now_ns, untaken_ns = ledger.now_ns, self._untaken_ns[row]
+        if any_of(another):
+            last_ns, again_ns = self._another_ns[row], self._again_ns[row]
+            untaken_ns[another & (now_ns - last_ns <= again_ns)] = now_ns + again_ns
+            last_ns[another] = now_ns
+            self._until_ns[row] = int(untaken_ns.max())
+        here &= ~another & (now_ns >= untaken_ns)
         return here
 
     @property
