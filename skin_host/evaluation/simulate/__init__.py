@@ -8,5 +8,7 @@ promises are checked against the emulator's own truth.
 - `world`: robot, buses (`cables`), `broker`, `disk`, the daemon's lives, what presses the skin
 - `troubles`: what goes wrong, and what health may and must report of it
 - `promises`: what must hold all the while
-- `run`: storms and calms
+- `deeds`: what is done to them, each deed noted for the promises
+- `storm`, `calm`, `exercises`: when which deeds are done
+- `run`: one run of these, and many side by side
 """

@@ -23,9 +23,13 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.accusations import STARTED_NS
 from skin_host.evaluation.simulate.cables import Cable, Sent, SimulatedPort
+from skin_host.evaluation.simulate.calm import Calm
+from skin_host.evaluation.simulate.deeds import Deeds
 from skin_host.evaluation.simulate.disk import PowerCut
+from skin_host.evaluation.simulate.exercises import LONGEST_DRILL_S
 from skin_host.evaluation.simulate.promises import Promises
-from skin_host.evaluation.simulate.run import LONGEST_DRILL_S, _Run
+from skin_host.evaluation.simulate.run import _Run
+from skin_host.evaluation.simulate.storm import Storm
 from skin_host.evaluation.simulate.trace import Trace
 from skin_host.evaluation.simulate.troubles import KINDS, Trouble, act
 from skin_host.evaluation.simulate.world import Life, World
@@ -418,16 +422,16 @@ def test_a_daemon_that_dies_while_it_is_asked_to_end_has_not_ended_the_run(
     """`icub_hand.toml` 9054: it was about to write, and the rest of the hour did not pass."""
 
     async def live() -> None:
-        run = _Run(world, tmp_path, 2, 60.0, None)
-        run._promises = Promises(world)
+        promises = Promises(world)
+        deeds = Deeds(world, promises, tmp_path)
         life = start(world)
         await world.clock.sleep(8.0)
-        stopping = asyncio.create_task(run._stop())
+        stopping = asyncio.create_task(deeds.stop())
         await world.clock.sleep(0.001)
         assert not life.task.done()
-        run._kill(power=power)
+        deeds.kill(power=power)
         await stopping
-        assert run._promises.broken is None
+        assert promises.broken is None
         assert world.life is None
         assert life.dead
 
@@ -441,7 +445,7 @@ def test_a_run_that_ends_before_its_time_has_not_kept_its_promises(
     async def end(_: object) -> None:
         raise PowerCut
 
-    monkeypatch.setattr(_Run, "_storm", end)
+    monkeypatch.setattr(Storm, "rage", end)
     with pytest.raises(PowerCut), world.clock.runner() as runner:
         runner.run(_Run(world, tmp_path, 2, 60.0, None).live())
 
@@ -1210,7 +1214,6 @@ def test_a_calm_ends_though_pads_of_real_skin_that_were_stuck_from_the_first_are
     worn: World, tmp_path: Path
 ) -> None:
     """Damaged bytes were their noise when they were calibrated; other pads may not be stuck."""
-    run = _Run(worn, tmp_path, 2, 60.0, None)
     held = np.flatnonzero(~np.isnan(worn.robot.skin.held_ff))
     part = next(part for part in worn.layout.parts if part.start <= held[0] < part.stop)
     stuck = int(held[0]) - part.start
@@ -1228,13 +1231,14 @@ def test_a_calm_ends_though_pads_of_real_skin_that_were_stuck_from_the_first_are
         ).encode()
 
     async def live() -> None:
-        run._promises = Promises(worn)
-        pads = run._promises.accusations.stuck[part.name]
-        assert run._faults(record("degraded", [stuck], [stuck]), pads) == []
-        assert run._faults(record("degraded", [stuck], [stuck, stuck + 1]), pads)
-        assert run._faults(record("degraded", [stuck + 1], [stuck + 1]), pads)
-        assert run._faults(record("silent", [], []), pads)
-        assert run._faults(record("degraded", [stuck], [stuck]), frozenset())
+        promises = Promises(worn)
+        calm = Calm(Deeds(worn, promises, tmp_path))
+        pads = promises.accusations.stuck[part.name]
+        assert calm._faults(record("degraded", [stuck], [stuck]), pads) == []
+        assert calm._faults(record("degraded", [stuck], [stuck, stuck + 1]), pads)
+        assert calm._faults(record("degraded", [stuck + 1], [stuck + 1]), pads)
+        assert calm._faults(record("silent", [], []), pads)
+        assert calm._faults(record("degraded", [stuck], [stuck]), frozenset())
 
     with worn.clock.runner() as runner:
         runner.run(live())
