@@ -404,3 +404,33 @@ def test_a_short_silence_after_a_long_one_is_as_long(seed: int, common_units: fl
         raw = np.clip(np.rint(NO_LOAD - units), 0, 255).astype(np.uint8)
         found = test.step(raw, skin.known, round(sweep * PERIOD_S * 1e9))
     assert found is False
+
+
+def test_a_board_is_not_clear_by_sweeps_that_waited_on_the_way() -> None:
+    """What came in one go may all be from before the zero."""
+    skin = Skin(6, n=190)
+    test = SilentZero(skin.baseline, skin.noise, skin.spread, skin.known, NO_LOAD, PERIOD_S, 0.1)
+    seen = []
+    for t_ms in (0, 50, 100, 101, 151):
+        units = skin.baseline + skin.fast * skin.rng.standard_normal(190)
+        raw = np.clip(np.rint(NO_LOAD - units), 0, 255).astype(np.uint8)
+        test.step(raw, skin.known, t_ms * 1_000_000)
+        seen.append(test.clear)
+    assert seen == [False, False, True, False, False]
+
+
+def test_a_board_that_is_not_clear_at_once_may_be_so_later() -> None:
+    """Half of the first sweeps read nearly what a zero would: two sweeps are too few to tell."""
+    skin = Skin(7, n=24)
+    skin.noise[:] = skin.fast[:] = skin.spread[:] = 1.0
+    skin.slow[:] = 0.0
+    skin.baseline = np.where(np.arange(24) % 2, 4.0, -4.0)
+    test = SilentZero(skin.baseline, skin.noise, skin.spread, skin.known, NO_LOAD, PERIOD_S, 0.1)
+    clear = []
+    for sweep in range(SWEEPS - 1):
+        share = 0.2 if sweep < 3 else 1.0
+        raw = np.rint(NO_LOAD - share * skin.baseline).astype(np.uint8)
+        test.step(raw, skin.known, round(sweep * PERIOD_S * 1e9))
+        clear.append(test.clear)
+    assert not any(clear[:3])
+    assert clear[-1]
