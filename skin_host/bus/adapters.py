@@ -322,10 +322,13 @@ class AdapterPort(Port):
                 self._opening = self._in_order().submit(open_bus, self.name, self._settings)
         elif self._opening.done():
             opening, self._opening = self._opening, None
-            if opening.exception() is None:
-                self._bus = opening.result()
-                self.counters.reopened += 1
-                self._enter(LinkState.UP)
+            error = opening.exception()
+            if error is not None:
+                self.note_unopened(error)
+                return
+            self._bus = opening.result()
+            self.counters.reopened += 1
+            self._enter(LinkState.UP)
 
 
 def open_bus(name: str, settings: Bus) -> can.BusABC:
@@ -355,7 +358,6 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
     except Exception as error:
         # Each adapter's library has its own errors; the user gets one kind.
         why = one_line(error)
-        # What is not installed does not come by waiting.
         absent = ""
         if settings.interface == MULTICAST and find_spec("msgpack") is None:
             why, absent = "the package msgpack is not installed", "skin-host[multicast]"
@@ -365,9 +367,7 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
         elif isinstance(error, TypeError):  # of its arguments, which are these
             why += f"; python-can's {settings.interface} takes them from [buses.{name}.options]"
         if absent:
-            raise ConfigurationError(
-                f"{where}: cannot be opened: {why}; mend it with: pip install '{absent}'"
-            ) from None
+            why += f"; mend it with: pip install '{absent}'"
         raise BusError(f"{where}: cannot be opened: {why}") from None
     return bus
 

@@ -327,20 +327,13 @@ class BoardLedger:
         A board's timer is regular, whatever period is set. Irregular intervals are delays
         elsewhere.
         """
-        # For so few numbers a list is faster than an array.
-        intervals = sorted(self._intervals_ns[row][: self._n_intervals[row]])
-        if len(intervals) < INTERVALS // 2 - 1:
-            return None
-        fifth, usual_ns = len(intervals) // 5, float(median(intervals))
-        spread_ns = intervals[-1 - fifth] - intervals[fifth]
-        return usual_ns if spread_ns < UNEVEN * usual_ns else None
+        return regular_ns(self._intervals_ns[row][: self._n_intervals[row]])
 
     def keeps_period(self, row: int) -> bool | None:
         """Return whether a board sends in its configured period, within `WRONG_PERIOD`; None where
         `regular_period_ns` is not known.
         """
-        seen_ns, period_ns = self.regular_period_ns(row), float(self._period_ns[row])
-        return None if seen_ns is None else abs(seen_ns - period_ns) <= WRONG_PERIOD * period_ns
+        return is_period(self.regular_period_ns(row), float(self._period_ns[row]))
 
     def _note_crowd(self, row: int, sweep: Sweep) -> None:
         """Decide whether two boards send at an address.
@@ -412,3 +405,23 @@ class BoardLedger:
             self.now_ns += passed_ns
         elif passed_ns > -LONGEST_DISORDER_NS:
             self._newest_ns = newest_ns
+
+
+def regular_ns(intervals_ns: list[int]) -> float | None:
+    """Return the median of the last `INTERVALS` intervals of a board, or None if they are few or
+    irregular.
+    """
+    # For so few numbers a list is faster than an array.
+    intervals = sorted(intervals_ns)
+    if len(intervals) < INTERVALS // 2 - 1:
+        return None
+    fifth, usual_ns = len(intervals) // 5, float(median(intervals))
+    spread_ns = intervals[-1 - fifth] - intervals[fifth]
+    return usual_ns if spread_ns < UNEVEN * usual_ns else None
+
+
+def is_period(seen_ns: float | None, period_ns: float) -> bool | None:
+    """Return whether what is seen of a period is that period, within `WRONG_PERIOD`; None where
+    nothing is known of it.
+    """
+    return None if seen_ns is None else abs(seen_ns - period_ns) <= WRONG_PERIOD * period_ns

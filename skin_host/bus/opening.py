@@ -30,13 +30,14 @@ def open_port(
         clock: for waiting.
 
     Raises:
-        ConfigurationError: python-can has no such kind of interface, or its package is missing.
-        BusError: the interface is absent, down, not CAN, not permitted, or not supported, and
-            `wait` is not set.
+        ConfigurationError: python-can has no such kind of interface.
+        BusError: the interface is absent, down, not CAN, not permitted, or not supported, or its
+            package is not installed, and `wait` is not set.
     """
     if bus.interface == PAIR:
         return PairPort(name, bus, clock)
     opened: can.BusABC | None
+    unopened: SkinError | None = None
     worker: Executor | None = None
     opening: Future[can.BusABC] | None = None
     try:
@@ -53,7 +54,7 @@ def open_port(
                 worker.close()
             raise
         log.warning("%s; waiting for it", error)
-        opened = None
+        opened, unopened = None, error
     if bus.interface == "socketcan":
         return socketcan.SocketCanPort(
             name, bus, receive, opened, lambda: socketcan.open_present(name, bus), clock
@@ -66,7 +67,10 @@ def open_port(
         )
     if opening is not None and opening.done():
         opening = None
-    return adapters.AdapterPort(name, bus, opened, clock, worker, opening)
+    port = adapters.AdapterPort(name, bus, opened, clock, worker, opening)
+    if unopened is not None:
+        port.note_unopened(unopened)
+    return port
 
 
 def _opened(name: str, bus: Bus, opening: "Future[can.BusABC]") -> can.BusABC:
@@ -83,8 +87,9 @@ def open_bus(name: str, bus: Bus) -> can.BusABC:
     """Open a bus for callers that use python-can directly, such as the emulator.
 
     Raises:
-        ConfigurationError: python-can has no such kind of interface, or its package is missing.
-        BusError: the interface is absent, down, not CAN, not permitted, or not supported.
+        ConfigurationError: python-can has no such kind of interface.
+        BusError: the interface is absent, down, not CAN, not permitted, or not supported, or its
+            package is not installed.
     """
     if bus.interface == "socketcan":
         return socketcan.open_checked(name, bus)

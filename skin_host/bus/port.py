@@ -111,6 +111,8 @@ class Port(ABC):
         name: of the bus in the configuration.
         channel: of the interface, e.g. "can0".
         state: of the link, as far as it is known.
+        unopened: why it could not be opened when that was last tried; empty where it is open, or
+            its device is absent.
         counters: of everything since opening.
         capacity: most frames of one read.
         stamps_late: time stamps may be those of reading or of another process, so a busy computer
@@ -129,6 +131,7 @@ class Port(ABC):
         self._clock = clock
         self.channel = settings.channel
         self.state = LinkState.GONE if bus is None else LinkState.UP
+        self.unopened = ""
         self.counters = PortCounters()
         self.on_sent: Callable[[int, bytes], None] = lambda *_: None
         self._settings = settings
@@ -217,6 +220,7 @@ class Port(ABC):
         if state is self.state:
             return
         self.state = state
+        self.unopened = ""
         self._reason = f" ({reason})" if reason else ""
         match state:
             case LinkState.BUS_OFF:
@@ -227,6 +231,10 @@ class Port(ABC):
                 self.counters.link_downs += 1
             case LinkState.GONE:
                 self.counters.removals += 1
+
+    def note_unopened(self, error: BaseException) -> None:
+        """Note why the bus could not be opened: waiting alone may not help."""
+        self.unopened = one_line(error).removeprefix(f'bus "{self.name}": ')
 
     def _log_state(self) -> None:
         """Log the state if it differs from the last logged one."""

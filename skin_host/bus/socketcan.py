@@ -347,8 +347,12 @@ class SocketCanPort(Port):
         if self._time_to_check():
             try:
                 self._use(self._reopen())
-            except (BusError, OSError):
-                return  # the next check tries again
+            except (BusError, OSError) as error:
+                # The next check tries again.
+                if _interface_exists(self.channel):
+                    self.note_unopened(error)
+                return
+            self.unopened = ""
             self.counters.reopened += 1
             # Whether it is up is known from its flags, or from the first frame.
             self.state = LinkState.DOWN

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.commands import Analog, SetTransmissionPeriod, SetTxMode, command_frame, message
+from skin_host.bus.ledger import BURST_NS, TWICE_NS, TWICE_SWEEPS
 from skin_host.bus.wire import HOST_ADDRESS, FrameBatch, MessageClass, identifier
 
 Floats = NDArray[np.float64]
@@ -165,6 +166,7 @@ class StrainCounters:
         lone: frames whose other half did not arrive in time.
         late: of these, those whose other half came next, but later.
         saturated: samples with a saturated channel.
+        doubled: frames that came twice in a row.
         wrong_length: frames that were neither force nor torque.
     """
 
@@ -172,17 +174,51 @@ class StrainCounters:
     lone: int = 0
     late: int = 0
     saturated: int = 0
+    doubled: int = 0
     wrong_length: int = 0
 
 
 class _Half(NamedTuple):
-    """A frame: its time, type and values; `begins` if it came after a pause."""
+    """A frame: its time, type and values (N or N m); `begins` if it came after a pause."""
 
     t_ns: int
     kind: int
-    value: NDArray[np.int32]
+    value: Floats
     saturated: bool
     begins: bool
+
+
+class _TooMany:
+    """Decides by the times of one type of frames whether more come than one board sends.
+
+    What waited while a computer was busy comes in one burst, which does not count.
+
+    Attributes:
+        found: whether too many have come, for `TWICE_NS` or longer.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self.found = False
+        self._period_ns = period_ns
+        self._since_ns: int | None = None
+        self._counted_ns = 0
+        self._counted = 0
+
+    def take(self, t_ns: int) -> None:
+        """Take in the time of a frame."""
+        since_ns = self._since_ns
+        if since_ns is None or t_ns < since_ns:
+            self._since_ns = self._counted_ns = t_ns
+            self._counted = 0
+        elif t_ns - since_ns < BURST_NS:
+            self._counted_ns, self._counted = t_ns, 0
+        else:
+            self._counted += 1
+            if t_ns - since_ns >= TWICE_NS:
+                passed_ns = t_ns - self._counted_ns
+                self.found = self._counted * self._period_ns > TWICE_SWEEPS * passed_ns
+                self._since_ns = self._counted_ns = t_ns
+                self._counted = 0
 
 
 class WrenchAssembler:
@@ -215,6 +251,9 @@ class WrenchAssembler:
         self.board = board
         self.full_scale = full_scale
         self.counters = StrainCounters() if counters is None else counters
+        self._too_many = _TooMany(1_000_000 * period_ms)
+        #: Of a value of 1, by type: float64[2, 3].
+        self._unit = full_scale.reshape(2, -1) / ZERO_WORD
         period_ns = self._period_ns = 1_000_000 * period_ms
         self._pair_ns = period_ms * PAIR_NS_PER_MS
         self._next_ns = min(NEXT_NS, NEXT_SHARE * period_ns)
@@ -229,21 +268,51 @@ class WrenchAssembler:
         self._first: int | None = None
         self._force_first = 0
 
+    @property
+    def twice(self) -> bool:
+        """Whether more is sent than one board sends: a second one has its address, or two gateways
+        pass its frames on.
+        """
+        return self._too_many.found
+
     def take(self, frames: StrainFrames, t_ns_of: NDArray[np.int64]) -> list[Wrench]:
         """Take a batch's frames, and its times [n]; return the samples that they complete."""
         self.counters.wrong_length += int(np.count_nonzero(frames.wrong_length == self.board))
-        mine = (frames.board == self.board) & (frames.type >= LOADS)
+        mine = np.flatnonzero((frames.board == self.board) & (frames.type >= LOADS))
+        kinds = frames.type[mine]
         samples = []
-        for i in np.flatnonzero(mine).tolist():
-            t_ns = int(t_ns_of[frames.row[i]])
+        for t_ns, kind, value, saturated in zip(
+            t_ns_of[frames.row[mine]].tolist(),
+            kinds.tolist(),
+            frames.value[mine] * self._unit[kinds - LOADS],
+            frames.saturated[mine].tolist(),
+            strict=True,
+        ):
             begins = self._before is None or abs(t_ns - self._before.t_ns) >= self._pause_ns
-            half = _Half(
-                t_ns, int(frames.type[i]), frames.value[i], bool(frames.saturated[i]), begins
-            )
+            half = _Half(t_ns, kind, value, saturated, begins)
+            if self._is_doubled(half):
+                self.counters.doubled += 1
+                continue
+            if kind == LOADS:
+                self._too_many.take(t_ns)
             sample = self._pair(half)
             if sample is not None:
                 samples.append(sample)
         return samples
+
+    def _is_doubled(self, half: _Half) -> bool:
+        """Whether it is the frame that came last, once more: a receiver that saw an error in the
+        last bit of a frame gets it again, as do two gateways in parallel.
+
+        The board itself sends the same type a period later.
+        """
+        before = self._before
+        return (
+            before is not None
+            and not half.begins
+            and (before.kind, before.saturated) == (half.kind, half.saturated)
+            and bool((before.value == half.value).all())
+        )
 
     def _pair(self, half: _Half) -> Wrench | None:
         before, self._before = self._before, half
@@ -275,8 +344,7 @@ class WrenchAssembler:
     def _joined(self, first: _Half, second: _Half) -> Wrench:
         in_order = first.kind == StrainType.FORCE
         force, torque = (first, second) if in_order else (second, first)
-        scaled = np.concatenate([force.value, torque.value]) * (self.full_scale / ZERO_WORD)
         saturated = first.saturated or second.saturated
         self.counters.samples += 1
         self.counters.saturated += saturated
-        return Wrench(second.t_ns, scaled[:3], scaled[3:], saturated)
+        return Wrench(second.t_ns, force.value, torque.value, saturated)

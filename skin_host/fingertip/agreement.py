@@ -4,7 +4,7 @@ from collections import deque
 
 import numpy as np
 
-from skin_host.bus.strain import Wrench
+from skin_host.bus.strain import Floats, Wrench
 
 #: So many samples are compared: with one damaged among them, the median is of the two others.
 AROUND = 3
@@ -27,13 +27,21 @@ class Agreement:
         self._samples.append(sample)
         if len(self._samples) < AROUND:
             return None
-        forces, torques = (
-            np.sort([getattr(one, name) for one in self._samples], axis=0)[AROUND // 2]
-            for name in ("force_n", "torque_nm")
+        before, middle, after = self._samples
+        saturated = before.saturated + middle.saturated + after.saturated > AROUND // 2
+        return Wrench(
+            middle.t_ns,
+            _median(before.force_n, middle.force_n, after.force_n),
+            _median(before.torque_nm, middle.torque_nm, after.torque_nm),
+            saturated,
         )
-        saturated = sum(one.saturated for one in self._samples) > AROUND // 2
-        return Wrench(self._samples[AROUND // 2].t_ns, forces, torques, saturated)
 
     def forget(self) -> None:
         """The next sample does not continue those before it."""
         self._samples.clear()
+
+
+def _median(a: Floats, b: Floats, c: Floats) -> Floats:
+    """Return the median of three, element by element; numpy's own takes ten times as long."""
+    median: Floats = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
+    return median

@@ -1,5 +1,6 @@
 """All fingertips of one node: takes CAN frames and the skin's contacts, returns events. Pure."""
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from skin_host.bus.ledger import INTERVALS, STALE_INTERVALS_NS, is_period, regular_ns
 from skin_host.bus.strain import (
     CHANNELS,
     LOADS,
@@ -71,6 +73,7 @@ class TipState:
         silenced: how often the board has timed out: has sent nothing, or no whole sample.
         alive: it sends.
         incomplete: it sends, and for too long no whole sample.
+        intervals_ns: between its last samples, by their time stamps.
         came, sampled: a frame of it, and a whole sample, was read since boards were last looked at.
         awaited: the board is being set up and has not had the time to send yet.
         zeroing, touching: samples of which a zero is taken, and whether it was touched in each.
@@ -98,6 +101,7 @@ class TipState:
     silenced: int = 0
     alive: bool = False
     incomplete: bool = False
+    intervals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=INTERVALS))
     came: bool = False
     sampled: bool = False
     awaited: bool = False
@@ -108,6 +112,27 @@ class TipState:
     def samples(self) -> int:
         """How many whole samples it has sent."""
         return 0 if self.assembler is None else self.assembler.counters.samples
+
+    @property
+    def sent_period_ns(self) -> float | None:
+        """Return in which period it sends; None where that is irregular, or not known yet.
+
+        By few intervals, one that loses half of its samples might seem regular.
+        """
+        return regular_ns(list(self.intervals_ns)) if len(self.intervals_ns) == INTERVALS else None
+
+    @property
+    def keeps_period(self) -> bool | None:
+        """Return whether it sends in its configured period; None as `sent_period_ns`."""
+        return is_period(self.sent_period_ns, 1e6 * self.settings.period_ms)
+
+    @property
+    def twice(self) -> bool:
+        """Whether a second board sends at its address, so that each sample is of one or the other.
+        One that is only faster than configured is none.
+        """
+        many = self.assembler is not None and self.assembler.twice
+        return many and self.keeps_period is not False
 
     def lately(self, at_ns: int | None) -> bool:
         """Whether what came at a time, by the ledger's clock, is of what the board sends now."""
@@ -251,6 +276,11 @@ class FingertipEngine:
         if self._now_ns - state.sampled_ns >= state.tip.lost_ns:
             state.agreement.forget()
             state.frozen.doubt()
+        interval_ns = wrench.t_ns - state.last_ns
+        if 0 < interval_ns < STALE_INTERVALS_NS:
+            state.intervals_ns.append(interval_ns)
+        else:
+            state.intervals_ns.clear()
         state.last_ns, state.sampled_ns = wrench.t_ns, self._now_ns
         state.sampled, state.incomplete = True, False
 
@@ -319,7 +349,8 @@ class FingertipEngine:
         self._zeroing = False
         found = {}
         for name, state in self.tips.items():
-            if len(state.zeroing) >= FEWEST_SAMPLES and state.frozen.trusted:
+            trusted = state.frozen.trusted and not state.twice
+            if len(state.zeroing) >= FEWEST_SAMPLES and trusted:
                 assert state.assembler is not None
                 samples = np.array(state.zeroing)
                 whole = ~damaged(samples, state.assembler.full_scale / ZERO_WORD)
@@ -361,7 +392,8 @@ class FingertipEngine:
         events: list[FingertipEvent] = []
         load = state.agreement.take(wrench)
         state.frozen.take(wrench)
-        if not state.frozen.trusted or state.exchanged:
+        trusted = state.frozen.trusted and not state.twice
+        if not trusted or state.exchanged:
             events = state.tip.lose(wrench.t_ns)
             self._note_touch(state)
         elif load is not None:
@@ -369,7 +401,7 @@ class FingertipEngine:
                 state.saturated_ns = load.t_ns
             events = state.tip.step(load)
             self._note_touch(state)
-        if self._zeroing and not wrench.saturated and state.frozen.trusted:
+        if self._zeroing and not wrench.saturated and trusted:
             state.zeroing.append(np.concatenate([wrench.force_n, wrench.torque_nm]))
             state.touching.append(state.tip.touched)
         return events

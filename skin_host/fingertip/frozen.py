@@ -33,7 +33,7 @@ class Frozen:
     @property
     def trusted(self) -> bool:
         """Whether both have changed since the start or the last doubt, and are not repeated."""
-        return all(half.changes for half in self._halves.values())
+        return self._halves["force"].changes and self._halves["torque"].changes
 
     @property
     def repeated(self) -> list[str]:

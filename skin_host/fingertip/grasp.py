@@ -25,6 +25,11 @@ class Flags(IntFlag):
     OVER = 16
 
 
+_NONE = Flags(0)
+# As plain numbers: an operation on members of an enumeration takes as long as ten on these.
+_MOVE, _TOUCH, _SLIP, _OVER = map(int, (Flags.MOVE, Flags.TOUCH, Flags.SLIP, Flags.OVER))
+
+
 @dataclass(frozen=True, slots=True)
 class GraspThresholds:
     """F1, F2 and dr of Ohka et al., and the times that the paper does not give."""
@@ -45,15 +50,15 @@ def analyse(
 
     `slips`: another sign than the rate of the shear force shows that it slips.
     """
-    flags = Flags(0)
     largest = float(normal_n.max(initial=0.0))
+    flags = 0
     if slips or shear_rate_n_s.max(initial=0.0) > thresholds.slip_n_s:
-        flags |= Flags.SLIP
-    if largest > thresholds.touch_n or flags & Flags.SLIP:
-        flags |= Flags.TOUCH
+        flags |= _SLIP
+    if largest > thresholds.touch_n or flags & _SLIP:
+        flags |= _TOUCH
     if largest > thresholds.over_n:
-        flags |= Flags.OVER
-    return flags
+        flags |= _OVER
+    return Flags(flags)
 
 
 def next_mode(mode: Flags, *, touch: bool, lost: bool, done: bool) -> Flags:
@@ -107,23 +112,27 @@ class FingerFlags:
             others_touch: the other fingers of the hand touch.
             done: the requested motion is finished.
         """
-        seen = analyse(normal_n, shear_rate_n_s, self._thresholds, slips=slips)
-        if seen & Flags.SLIP:
+        seen = int(analyse(normal_n, shear_rate_n_s, self._thresholds, slips=slips))
+        if seen & _SLIP:
             self._slipped_ns = t_ns
         elif _within(self._slipped_ns, t_ns, self._thresholds.slip_hold_s):
-            seen |= Flags.SLIP | Flags.TOUCH
-        touch = bool(seen & Flags.TOUCH)
+            seen |= _SLIP | _TOUCH
+        touch = bool(seen & _TOUCH)
         if touch:
             self._touched_ns = t_ns
         lost = not _within(self._touched_ns, t_ns, self._thresholds.lost_s)
+        before = int(self.flags)
         mode = next_mode(
-            self.flags & (Flags.SEARCH | Flags.MOVE),
+            Flags.MOVE if before & _MOVE else Flags.SEARCH,
             touch=touch and others_touch,
             lost=lost,
             done=done,
         )
-        before, self.flags = self.flags, seen | mode
-        return before ^ self.flags
+        now = seen | int(mode)
+        if now == before:
+            return _NONE
+        self.flags = Flags(now)
+        return Flags(before ^ now)
 
 
 def _within(since_ns: int | None, t_ns: int, seconds: float) -> bool:

@@ -39,6 +39,7 @@ class FingertipRecord(TypedDict):
     rate_hz: float
     lone: int
     saturated: int
+    doubled: int
     wrong_length: int
     silences: int
     full_scale: list[float] | None
@@ -89,6 +90,7 @@ class FingertipHealth:
             "rate_hz": round(rate_hz, 2),
             "lone": counters.lone,
             "saturated": counters.saturated,
+            "doubled": counters.doubled,
             "wrong_length": counters.wrong_length,
             "silences": state.silenced,
             "full_scale": None if assembler is None else assembler.full_scale.tolist(),
@@ -117,8 +119,23 @@ class FingertipHealth:
             yield fault(
                 "silent", f"{here} has stopped sending; it is set up again; check its power"
             )
+        elif state.twice:
+            yield fault(
+                "twice",
+                f"{here} sends more than one board in {table.period_ms} ms: another one has its "
+                "address, or two gateways pass its frames on; give each board an address of its "
+                "own; it is set up again, in case it sends too often; until then nothing is felt",
+            )
         elif state.incomplete:
             yield fault("incomplete", f"{here} {_incomplete(state)}")
+        elif state.keeps_period is False:
+            seen_ms = (state.sent_period_ns or 0.0) / 1e6
+            yield fault(
+                "period",
+                f"{here} sends every {seen_ms:.3g} ms, not {table.period_ms} ms: slips may not be "
+                "noticed; it is set up again; if this stays, another program sets it up, or it "
+                f"cannot do that: change fingertips.{name}.period_ms",
+            )
         if state.frames and assembler is None:
             yield fault(
                 "not_configured",

@@ -66,11 +66,14 @@ class StrainBoards:
         """Supervise every board; set-ups run as separate tasks, so this does not wait for them."""
         now_ns = self._clock()
         for board in self._boards:
+            # More than one board sends may be of one that sends too often, and irregularly.
+            in_time = board.state.keeps_period is not False and not board.state.twice
             if board.state.samples != board.samples:
                 board.samples, board.sampled_ns = board.state.samples, now_ns
-                board.retries = 0
+                if in_time:
+                    board.retries = 0
             # What comes but is no sample, as force without torque, is no more than silence.
-            well = now_ns - board.sampled_ns <= board.state.tip.silent_ns
+            well = now_ns - board.sampled_ns <= board.state.tip.silent_ns and in_time
             due = board.started and now_ns >= board.retry_at_ns
             board.state.awaited &= not (due or board.state.frames)
             if due and self._busy is None and not (well and board.state.scale_before is None):

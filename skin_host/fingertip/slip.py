@@ -29,6 +29,11 @@ Ages = tuple[int, ...] | None
 FALSE_ALARMS_PER_HOUR = 0.1
 
 
+def size(vector: Floats) -> float:
+    """Return the length of a vector float64[3]; `numpy.linalg.norm` takes ten times as long."""
+    return math.sqrt(vector @ vector)
+
+
 def friction_used(
     normal_n: ArrayLike, shear_n: ArrayLike, friction: float, *, minimum_n: float = 0.1
 ) -> Floats:
@@ -130,16 +135,19 @@ class RatioDrop:
             ages: of the last samples, those of the two windows at least.
         """
         normal = np.asarray(normal_n, np.float64)
-        tangential = np.linalg.norm(np.asarray(shear_n, np.float64), axis=-1)
+        shear = np.asarray(shear_n, np.float64)
+        tangential = np.hypot(shear[:, 0], shear[:, 1])
         heavy = normal >= self._minimum_n
         safe = np.where(heavy, normal, 1.0)
         self._past[:-1] = self._past[1:]
         self._past[-1] = np.where(heavy, tangential / safe, np.nan)
-        before = self._past[: self.WINDOW].mean(axis=0)
-        after = self._past[self.WINDOW :].mean(axis=0)
-        noise = self._force_sd_n / safe * np.sqrt((1.0 + after**2) * 2.0 / self.WINDOW)
-        least = self.LEAST_DROP * self._stretch(ages)
-        slips: Mask = before - after > np.maximum(least, 6.0 * noise)
+        # A sum takes a third of the time of a mean.
+        before = np.add.reduce(self._past[: self.WINDOW]) / self.WINDOW
+        after = np.add.reduce(self._past[self.WINDOW :]) / self.WINDOW
+        slips: Mask = before - after > self.LEAST_DROP * self._stretch(ages)
+        if np.count_nonzero(slips):  # the noise is of interest for these alone
+            noise = self._force_sd_n / safe * np.sqrt((1.0 + after**2) * 2.0 / self.WINDOW)
+            slips &= before - after > 6.0 * noise
         return slips
 
     def _stretch(self, ages: Ages) -> float:
@@ -183,11 +191,14 @@ class ShearRate:
         """dFs/dt itself, float64[n, d], N/s, as `step`."""
         shear = np.asarray(shear_n, np.float64)
         self._past[:-1] = self._past[1:]
-        self._past[-1] = np.where(np.isfinite(shear), shear, self._past[-2])
+        is_number = np.isfinite(shear)
+        self._past[-1] = shear if is_number.all() else np.where(is_number, shear, self._past[-2])
         weight = self._weight if ages is None else self._weight_of(-np.array(ages))
-        rate = np.tensordot(weight, self._past, axes=1)
-        known: Floats = np.where(np.isfinite(rate).all(axis=-1, keepdims=True), rate, 0.0)
-        return known
+        rate: Floats = (weight @ self._past.reshape(len(weight), -1)).reshape(self._past.shape[1:])
+        is_number = np.isfinite(rate)
+        if is_number.all():
+            return rate
+        return np.where(is_number.all(axis=-1, keepdims=True), rate, 0.0)
 
     def _weight_of(self, periods: NDArray[np.int_]) -> Floats:
         """Return what each sample adds to the slope, 1/s, from when it was taken, int[w]."""
@@ -249,19 +260,23 @@ class SlipWatch:
         """
         # Rate of the whole force, because its tangential axes turn with the place of the contact.
         ages = self._ages.step(t_ns)
-        change = self._derivative.derivative(load[None, :3], ages)[0]
+        force = load[:3]
+        change = self._derivative.derivative(force[None], ages)[0]
         if normal is None:
             # No ratio is known, and a later one is not compared with those before.
-            self._fall.step(np.zeros(1), np.zeros((1, 2)))
-            return Seen(float(np.linalg.norm(load[:3])))
-        normal_n = max(0.0, -float(load[:3] @ normal))
-        shear = load[:3] + normal_n * normal
-        shear_n = float(np.linalg.norm(shear))
-        fell = self._fall.step(np.array([normal_n]), np.array([[shear_n, 0.0]]), ages)[0]
+            if self._friction is None:
+                self._fall.step(np.zeros(1), np.zeros((1, 2)))
+            return Seen(size(force))
+        normal_n = max(0.0, -float(force @ normal))
+        shear = force + normal_n * normal
+        shear_n = size(shear)
+        fell = False
+        if self._friction is None:
+            fell = self._fall.step(np.array([normal_n]), np.array([[shear_n, 0.0]]), ages)[0]
         if not settled:
             return Seen(normal_n, shear_n)
         change = change - (change @ normal) * normal
-        rate = float(np.linalg.norm(change))
+        rate = size(change)
         cause: Cause | None = None
         if rate > self.threshold_n_s:
             cause = "rate"

@@ -28,7 +28,7 @@ from skin_host.fingertip.intrinsic import (
 )
 from skin_host.fingertip.low_pass import Butterworth2
 from skin_host.fingertip.reach import reach_n
-from skin_host.fingertip.slip import SlipWatch
+from skin_host.fingertip.slip import SlipWatch, size
 from skin_host.processing.calibration import Zero
 from skin_host.processing.contacts import ALIVE_NS, LOST_NS, MOVED_M, PRESSED_SHARE
 from skin_host.processing.events import (
@@ -257,14 +257,14 @@ class Tip:
         measured = np.concatenate([wrench.force_n, wrench.torque_nm]) - self._zero.offset
         load = self._moved(measured[None])[0]
         least_n = self.threshold_n * (1.0 if self._reported is None else RELEASE)
-        touches = wrench.saturated or float(np.linalg.norm(load[:3])) >= least_n
+        touches = wrench.saturated or size(load[:3]) >= least_n
         if self._reported is None:
             if not touches and self.flags == Flags.SEARCH:
                 return []
             if touches:
                 self._restart()  # the samples before belong to no contact
         smooth = self._filter.step(load)
-        if touches and np.linalg.norm(smooth[:3]) < least_n:
+        if touches and size(smooth[:3]) < least_n:
             smooth = load
         # The place is computed only when it may be reported; slips are detected at every sample.
         locates = (
@@ -329,7 +329,7 @@ class Tip:
 
     def _locate(self, load: Floats, least_n: float) -> IntrinsicContact:
         noise_nmm = math.sqrt(float(np.trace(self._covariance[3:, 3:])) / 3.0)
-        force_n = max(float(np.linalg.norm(load[:3])), least_n)
+        force_n = max(size(load[:3]), least_n)
         return locate(
             load[:3],
             load[3:],
@@ -361,6 +361,8 @@ class Tip:
             slips=seen.cause is not None,
         )
         events: list[FingertipEvent] = []
+        if not changed:
+            return events  # nearly always
         for flag in changed & (Flags.SLIP | Flags.OVER):
             event: Change = "begin" if flag & self.flags else "end"
             if event == "begin":
@@ -415,7 +417,7 @@ class Tip:
                 verdict = "several_contacts"
             if verdict == "contact":
                 place = locate_with_skin(load, contact, self._surface, self._covariance, skin)
-        normal_n, shear = float(np.linalg.norm(load[:3])), None
+        normal_n, shear = size(load[:3]), None
         if place is not None:
             normal_n = max(0.0, -float(load[:3] @ place.normal))
             shear = rounded((load[:3] + normal_n * place.normal).tolist(), N_DECIMALS)

@@ -540,6 +540,8 @@ class Describer:
         port = ports.get(name)
         if port is not None:
             record["state"] = str(port.state)
+            if port.unopened:
+                record["unopened"] = port.unopened
             record["port"] = msgspec.to_builtins(port.counters)
         manager = boards.get(name)
         if manager is not None:

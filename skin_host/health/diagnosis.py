@@ -161,7 +161,11 @@ def _bus(bus: BusHealth) -> Iterator[FoundFault]:
     state = bus.get("state", "up")
     if state in _BUS_STATES:
         code, sentence = _BUS_STATES[state]
-        yield fault(code, " " + sentence.format(channel=bus.get("channel", name)))
+        sentence = " " + sentence.format(channel=bus.get("channel", name))
+        if "unopened" in bus:
+            why = bus["unopened"]
+            sentence = f" is gone: {why}; it goes on when that is mended, or it is plugged in"
+        yield fault(code, sentence)
     elif bus.get("silent"):
         why = "check its plug, the boards' power and bit rate"
         if bus["interface"] in EMULATED or bus["channel"].startswith("vcan"):

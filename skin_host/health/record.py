@@ -33,7 +33,7 @@ class BusHealth(TypedDict):
 
     `port` are `PortCounters`. Unconfigured boards are given by type and address, and by the most
     frequent identifier among the frames of unconfigured nodes. `spiked_pads` are those of which a
-    single byte was off within the last ten seconds.
+    single byte was off within the last ten seconds. `unopened` is why the bus cannot be opened.
     """
 
     name: str
@@ -53,6 +53,7 @@ class BusHealth(TypedDict):
     halves: int
     missed: int
     state: NotRequired[str]
+    unopened: NotRequired[str]
     port: NotRequired[dict[str, int]]
     strangers: NotRequired[dict[int, int]]
     stranger: NotRequired[str]

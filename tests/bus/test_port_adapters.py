@@ -9,13 +9,14 @@ import tracemalloc
 import can
 import pytest
 
+from skin_host.bus import adapters
 from skin_host.bus.adapters import CAPACITY, AdapterPort, nanoseconds
 from skin_host.bus.multicast import MulticastBus
 from skin_host.bus.opening import open_bus, open_port
 from skin_host.bus.port import LinkState, Port
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Receive
-from skin_host.errors import BusError, ConfigurationError
+from skin_host.errors import BusError
 from tests.support.datagrams import FRAME
 from tests.support.waiting import PATIENCE_S
 
@@ -324,11 +325,38 @@ def test_an_adapter_whose_package_is_not_installed_names_it(monkeypatch, interfa
 
     monkeypatch.setattr("can.Bus", absent)
     bus = Bus(interface=interface, channel="/dev/none")
-    with pytest.raises(ConfigurationError, match=rf"pip install 'python-can\[{extra}\]'"):
+    with pytest.raises(BusError, match=rf"pip install 'python-can\[{extra}\]'"):
         open_bus("left", bus)
-    # A daemon that waited for it said that an adapter was to be plugged in.
-    with pytest.raises(ConfigurationError, match=rf"pip install 'python-can\[{extra}\]'"):
-        open_port("left", bus, Receive(), wait=True)
+
+
+def test_a_daemon_waits_for_a_package_as_for_an_adapter_and_names_it_until_it_is_there(
+    monkeypatch, caplog
+):
+    """It ended, so that the other buses of the robot were not read either."""
+    there = can.Bus
+
+    def absent(*_, **__):
+        raise can.CanInterfaceNotImplementedError("the module is not installed")
+
+    monkeypatch.setattr("can.Bus", absent)
+    clock = SteppedClock()
+    bus = Bus(interface="virtual", channel=f"adapters-{next(_numbers)}")
+    monkeypatch.setitem(adapters._EXTRAS, "virtual", "serial")
+    port = open_port("left", bus, Receive(), wait=True, clock=clock)
+    assert "pip install 'python-can[serial]'; waiting for it" in caplog.text
+    for _ in range(20):
+        assert len(port.read()) == 0
+        assert port.state is LinkState.GONE
+        assert port.unopened.startswith(f"virtual {bus.channel}: cannot be opened: the module is")
+        assert port.unopened.endswith("pip install 'python-can[serial]'")
+        clock.advance(0.1)
+    monkeypatch.setattr("can.Bus", there)
+    for _ in range(20):
+        port.read()
+        clock.advance(0.1)
+    assert port.state is LinkState.UP
+    assert port.unopened == ""
+    port.close()
 
 
 def test_an_adapter_that_lacks_its_options_names_where_they_are_given():

@@ -115,6 +115,30 @@ def test_force_and_torque_are_paired_in_either_order_and_scaled(order):
     assert assembler.counters.lone == 0
 
 
+@given(
+    order=st.permutations("ft"),
+    copies=st.lists(st.integers(1, 3), min_size=40, max_size=40),
+    late_ms=st.floats(0.0, 0.9),
+    values=st.lists(st.integers(-2, 2), min_size=20, max_size=20),
+)
+def test_frames_that_come_twice_in_a_row_are_taken_once(order, copies, late_ms, values):
+    """A fingertip whose frames all came twice was blind: no force was followed by its torque."""
+    sent = [(10 * i + k, kind, values[i]) for i in range(20) for k, kind in enumerate(order)]
+    # The order is learnt from frames that follow each other at once.
+    start = [(10 * i - 30 + 0.1 * k, kind, i) for i in range(3) for k, kind in enumerate(order)]
+    came = [
+        (t_ms + late_ms * copy / 3, kind, value)
+        for (t_ms, kind, value), n in zip(sent, copies, strict=True)
+        for copy in range(n)
+    ]
+    assembler = WrenchAssembler(13, 10, SCALE)
+    samples = samples_of(assembler, stream(*start, *came))
+    assert assembler.counters.lone == 0
+    assert assembler.counters.doubled == len(came) - len(sent)
+    found = [s.force_n[0] * 0x8000 / SCALE[0] for s in samples[3:]]
+    assert np.round(found).tolist() == values
+
+
 def test_a_lost_half_never_joins_two_samples():
     assembler = WrenchAssembler(13, 10, SCALE)
     samples = samples_of(

@@ -1,13 +1,16 @@
 """Between the buses and the core: every sweep counts, however it was closed."""
 
 from pathlib import Path
+from typing import Any
 
+import can
 import numpy as np
 import pytest
 
 from skin_host.bus import wire
 from skin_host.bus.assembler import AssemblerCounters
 from skin_host.bus.wire import FrameBatch
+from skin_host.clock import SteppedClock
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings
 from skin_host.daemon.link import Link
 from skin_host.layout import build_layout
@@ -222,3 +225,35 @@ def test_on_a_bus_that_never_ends_a_board_that_dies_has_timed_out(reader: Reader
         reader.arrive([(0x100, b"", reader.now_ns + i) for i in range(4)])
         reader.wait(1)
     assert reader.engine.ledger.is_silent(0)
+
+
+def test_a_bus_whose_package_is_not_installed_leaves_the_others_live(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    there = can.Bus
+
+    def bus(*args: Any, interface: str, **options: Any) -> can.BusABC:
+        if interface == "slcan":
+            raise can.CanInterfaceNotImplementedError("the serial module is not installed")
+        return there(*args, interface=interface, **options)
+
+    monkeypatch.setattr("can.Bus", bus)
+    settings = Settings(
+        robot="r",
+        buses={
+            "left": Bus(interface="slcan", channel="/dev/ttyACM0"),
+            "right": Bus(interface="virtual", channel="one-package-is-missing"),
+        },
+        boards={"l": Board(bus="left", address=1), "r": Board(bus="right", address=1)},
+        parts={
+            side: Part(patches=[Patch(board=side[0], triangles="0")]) for side in ("left", "right")
+        },
+    )
+    engine = Engine(settings, build_layout(settings, Path()), [0, 1])
+    link = Link(engine, wait=True, clock=SteppedClock())
+    with there(interface="virtual", channel="one-package-is-missing") as board:
+        board.send(can.Message(arbitration_id=0x410, data=bytes(8), is_extended_id=False))
+        link.turn(T0, lambda _: None)
+    assert link.ports["right"].counters.frames == 1
+    assert "pip install 'python-can[serial]'" in link.ports["left"].unopened
+    link.close()

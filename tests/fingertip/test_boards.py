@@ -12,11 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from emulator.boards.fingertips import StrainBoard
 from emulator.faults import parse
 from emulator.probes.scene import Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.answers import answer_frame
-from skin_host.bus.strain import FullScale, StrainType, Wrench
+from skin_host.bus.commands import SetTransmissionPeriod, command_frame
+from skin_host.bus.strain import FullScale, StrainType, Wrench, start_frames
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import changed, load
 from skin_host.daemon import metrics
@@ -29,7 +31,7 @@ from skin_host.layout import build_layout
 from skin_host.mqtt import messages
 from skin_host.processing.calibration import Zero
 from skin_host.processing.calibration.file import load_calibration, save_calibration
-from skin_host.processing.core import Engine
+from skin_host.processing.core import Engine, Output
 from skin_host.processing.events import Touch
 from tests.support.strain import encode_strain
 
@@ -162,6 +164,139 @@ async def test_metrics_tell_of_fingertips() -> None:
     page = metrics.exposition(bench.health.records(bench.robot.t_ns))
     assert 'skin_fingertip_touched{part="index"} 0' in page
     assert 'skin_faults{part="thumb"} 0' in page
+
+
+@pytest.mark.parametrize("period_ms", [1, 10])
+async def test_a_board_that_sends_in_another_period_is_named_and_set_up_again(
+    period_ms: int,
+) -> None:
+    """By the period slips are judged: at a third of it their rates are too low by three times."""
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    assert bench.tips.tips["index"].keeps_period
+    await bench.run(1.0)
+    # Another program's.
+    bench.robot.receive("can0", *command_frame(SetTransmissionPeriod(period_ms), 1))
+    bench.sent.clear()
+    sentences: set[str] = set()
+    for _ in range(20):
+        await bench.run(0.02)
+        sentences.update(bench.record()["sentences"])
+        assert bench.codes("thumb") == []
+    assert f"sends every {period_ms} ms, not 3 ms" in sentences.pop()
+    assert not sentences
+    assert command_frame(SetTransmissionPeriod(3), 1) in bench.sent
+    assert bench.codes() == []
+    bench.sent.clear()
+    await bench.run(10.0)
+    assert bench.sent == []
+
+
+async def test_a_board_that_cannot_send_in_its_period_is_set_up_ever_more_seldom() -> None:
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    board = bench.robot.fingertips.boards["index"]
+    handle = board.handle
+
+    def refuse(can_id: int, data: bytes, t_ns: int) -> list[tuple[int, bytes]]:
+        return [] if data[0] == SetTransmissionPeriod.CODE else handle(can_id, data, t_ns)
+
+    board.handle = refuse  # type: ignore[method-assign]
+    board.period_ms = 10
+    bench.sent.clear()
+    await bench.run(60.0)
+    assert bench.codes() == ["period"]
+    assert 5 <= bench.sent.count(command_frame(SetTransmissionPeriod(3), 1)) <= 11
+
+
+class TwoBoards:
+    """Let a second board send at the address of the index finger while `acts` is set."""
+
+    def __init__(self, bench: Bench, phase_ms: float) -> None:
+        self.acts = True
+        load = [0.4, 0.0, -0.8, 0.0, 0.0, 0.0]
+        scale = (50, 50, 50, 1, 1, 1)
+        other = StrainBoard(1, lambda _: load, np.random.default_rng(5), full_scale=scale)
+        for frame in start_frames(1, 3):
+            other.handle(*frame, bench.robot.t_ns + round(phase_ms * 1e6))
+        feed = bench.engine.feed
+
+        def both(bus: str, batch: FrameBatch) -> Output:
+            more = other.step(bench.robot.t_ns)
+            if not self.acts:
+                return feed(bus, batch)
+            frames = [
+                (int(one.id[row]), one.data[row, : one.dlc[row]].tobytes(), int(one.t_ns[row]))
+                for one in (batch, more)
+                for row in range(len(one))
+            ]
+            return feed(bus, FrameBatch.of(sorted(frames, key=lambda frame: frame[2])))
+
+        bench.engine.feed = both  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("phase_ms", [0.05, 0.15, 1.1, 1.5])
+async def test_two_boards_at_one_address_are_named_and_feel_nothing(phase_ms: float) -> None:
+    """Their samples came in turns, as 300 touches a second of a fingertip that was well."""
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    two = TwoBoards(bench, phase_ms)
+    bench.sent.clear()
+    await bench.run(4.5)
+    bench.felt.clear()
+    for _ in range(20):
+        await bench.run(0.1)
+        assert bench.codes()[0] == "twice"
+        assert bench.contact() == "UNKNOWN"
+    assert not bench.felt
+    # It may be one that sends too often.
+    assert 1 <= bench.sent.count(command_frame(SetTransmissionPeriod(3), 1)) <= 4
+    await bench.calibrate()
+    assert bench.codes()[0] == "twice"
+    assert not bench.tips.tips["index"].tip.zeroed
+    assert bench.tips.tips["thumb"].tip.zeroed
+    two.acts = False
+    await bench.run(5.0)
+    await bench.calibrate()
+    await bench.run(0.5)
+    assert (bench.codes(), bench.contact()) == ([], "OFF")
+
+
+@pytest.mark.parametrize("pause_s", [0.3, 1.0, 3.0])
+async def test_what_waited_while_a_computer_was_busy_is_not_of_two_boards(pause_s: float) -> None:
+    """As an adapter stamps it: all at the time of reading."""
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    state = bench.tips.tips["index"]
+    for _ in range(6):
+        waited = bench.robot.step(pause_s)["can0"]
+        waited.t_ns[:] = bench.robot.t_ns
+        bench.engine.feed("can0", waited)
+        for _ in range(60):
+            await bench.run(0.02)
+            assert not state.twice
+
+
+@given(st.lists(st.floats(-0.3, 0.3), min_size=40, max_size=40), st.floats(0.0, 0.2))
+def test_samples_that_are_late_or_lost_are_not_of_another_period(
+    late: list[float], lost: float
+) -> None:
+    bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
+    state = bench.tips.tips["index"]
+    rng = np.random.default_rng(round(1e3 * sum(late) ** 2))
+    for number, share in enumerate(late):
+        if rng.random() < lost:
+            continue
+        t_ns = 10**18 + round(3e6 * (number + share))
+        force = encode_strain(1, StrainType.FORCE, [0, 0, number])
+        torque = encode_strain(1, StrainType.TORQUE, [0, 0, number])
+        batch = FrameBatch.of([(*force, t_ns), (*torque, t_ns + 130_000)])
+        bench.engine.feed("can0", batch)
+        assert state.keeps_period is not False
 
 
 async def test_a_board_that_falls_silent_is_told_of_and_set_up_again() -> None:

@@ -170,3 +170,21 @@ def test_a_slow_fall_of_the_ratio_is_none_and_an_abrupt_one_is_one_whatever_is_l
         ratio = 0.5 if taken < 10 else 0.35
         found.append(bool(abrupt.step([5.0], [[5.0 * ratio, 0.0]], now)[0]))
     assert any(found)
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.0, 5.0), st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))),
+    st.floats(0.0, 0.1),
+)
+def test_the_ratio_falls_where_it_falls_by_more_than_a_slip_and_more_than_its_noise(samples, sd_n):
+    detector = RatioDrop(2, force_sd_n=sd_n)
+    ratios = []
+    for normal_n, *shear_n in samples:
+        found = detector.step([normal_n, 1.0], [shear_n, [0.5, 0.0]])
+        ratios.append(np.hypot(*shear_n) / normal_n if normal_n >= 0.2 else np.nan)
+        if len(ratios) < 4:
+            assert not found.any()
+            continue
+        before, after = np.mean(ratios[-4:-2]), np.mean(ratios[-2:])
+        noise = sd_n / max(normal_n, 1e-9) * np.sqrt(1.0 + after**2)
+        assert found.tolist() == [before - after > max(0.04, 6.0 * noise), False]

@@ -38,6 +38,16 @@ def test_a_bus_that_does_not_work_is_named_with_its_remedy(
     assert remedy in fault.sentence
 
 
+def test_a_bus_that_cannot_be_opened_is_named_with_what_the_system_answers(
+    calibrated: FaultBench,
+) -> None:
+    record: Any = copy.deepcopy(calibrated.records["left_hand"])
+    why = "slcan /dev/ttyACM0: cannot be opened: no serial; mend it with: pip install 'x'"
+    record["buses"][0] |= {"state": "gone", "unopened": why}
+    fault = next(one for one in diagnose(record) if one.code == "bus_gone")
+    assert f"is gone: {why}" in fault.sentence
+
+
 @pytest.mark.parametrize(
     ("interface", "channel", "words"),
     [

@@ -145,10 +145,12 @@ ELSEWHERE = {
     "fingertip_incomplete": "tests/fingertip/test_boards.py",
     "fingertip_loses_frames": "tests/fingertip/test_boards.py",
     "fingertip_not_configured": "tests/fingertip/test_boards.py",
+    "fingertip_period": "tests/fingertip/test_boards.py",
     "fingertip_pressed": "tests/fingertip/test_boards.py",
     "fingertip_saturated": "tests/fingertip/test_boards.py",
     "fingertip_scale": "tests/fingertip/test_boards.py",
     "fingertip_silent": "tests/fingertip/test_boards.py",
+    "fingertip_twice": "tests/fingertip/test_boards.py",
     "fingertip_unreached": "tests/fingertip/test_boards.py",
 }
 #: Codes of tests below.
@@ -187,6 +189,7 @@ class Seen:
     """What health reads of a port."""
 
     stamps_late = False
+    unopened = ""
 
     def __init__(self) -> None:
         self.state = LinkState.UP
