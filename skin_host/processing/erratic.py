@@ -2,7 +2,8 @@
 
 Pads jump faster than a hand, which is seen where sweeps come fast; or scatter beyond their measured
 range, see `scatter`. Where most pads of a chip do, it is the chip whose contact is broken: the
-others, which have not been found yet or have less noise, are no measurement either.
+others, which have not been found yet or have less noise, are no measurement either. Pads that have
+not been valid of late for another reason, as they are noisy or stuck, decide nothing in this.
 """
 
 from collections.abc import Sequence
@@ -37,6 +38,8 @@ LIMIT = 2.0
 CALM_S = 60.0
 #: Fewer pads of one chip may jump each by itself.
 LEAST_OF_CHIP = 3
+#: What was not valid at so many looks, one a second, has not been so of late.
+LATELY_LOOKS = 3
 
 
 class Erratic:
@@ -66,11 +69,12 @@ class Erratic:
     ) -> None:
         m = len(step_kpa)
         self._chip = np.unique(chip, return_inverse=True)[1].astype(np.intp)
-        #: Of each chip, how many pads must be erratic for the chip to be.
-        watched = np.bincount(self._chip[np.isfinite(step_kpa)], minlength=m)
-        self._enough = np.maximum(watched // 2 + 1, LEAST_OF_CHIP)
+        self._known: Mask = np.isfinite(step_kpa)
+        #: At how many looks each pad was last not valid.
+        self._missed = np.zeros(m, np.int8)
         self._step = step_kpa.astype(np.float32)
-        self._scatter = Scatter(self._step, range_kpa.astype(np.float32))
+        beside = next_of_chip(self._chip, np.isfinite(step_kpa))
+        self._scatter = Scatter(self._step, range_kpa.astype(np.float32), beside)
         self._score = np.zeros(m, np.float32)
         self._left_s = np.zeros(m)
         self._now_s = 0.0
@@ -138,8 +142,12 @@ class Erratic:
         np.greater(self._left_s, 0.0, out=self.pads)
         self.any = bool(self.pads.any())
         if self.any:
-            found = np.bincount(self._chip[self.pads], minlength=len(self._enough))
-            broken: Mask = found >= self._enough
+            judged = self._known & (self.pads | (self._missed < LATELY_LOOKS))
+            found, of_chip = (
+                np.bincount(self._chip[pads], minlength=len(self.pads))
+                for pads in (self.pads, judged)
+            )
+            broken: Mask = found >= np.maximum(of_chip // 2 + 1, LEAST_OF_CHIP)
             if broken.any():
                 np.logical_or(self.pads, broken[self._chip], out=self.pads)
 
@@ -184,11 +192,28 @@ class Erratic:
         self._scatter.reset(taxels)
         self.pass_time(0.0)
 
+    def note_valid(self, pads: Mask) -> None:
+        """Note once a second which pads [m] are valid, but for being erratic."""
+        self._missed += self._missed < LATELY_LOOKS
+        self._missed[pads] = 0
+
     def pass_time(self, dt_s: float) -> None:
         """Let time pass, after which calm pads are no longer erratic."""
         if self.any:
             self._left_s -= dt_s
             self._mark()
+
+
+def next_of_chip(chip: NDArray[np.intp], watched: Mask) -> NDArray[np.intp]:
+    """Return for each pad [m] the next watched one of its chip, of the last the first; for one that
+    is not watched, or alone, itself.
+    """
+    beside = np.arange(len(chip))
+    order = np.flatnonzero(watched)
+    order = order[np.argsort(chip[order], kind="stable")]
+    for pads in np.split(order, np.flatnonzero(np.diff(chip[order])) + 1):
+        beside[pads] = np.roll(pads, -1)
+    return beside
 
 
 def step_kpa(curve: Curve, noise_units: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -19,6 +19,12 @@ fingertip for 19), so repeats count for less while the board feels a touch.
 
 Single pads are judged in `stuck`.
 
+A pad is noisy when it jumps up and down. So does one that a hand taps, for boards that send too
+seldom to see more than one reading of a tap. There what most pads of a triangle do in one direction
+is no jump: what presses moves them together, while the pads of a broken chip read what they like.
+Where most pads of such a chip are noisy although it is known how noisy they are under pressure, its
+connection is broken, as in `erratic`, which sees that where sweeps come faster.
+
 Much of what a step costs is that its code is found cold. So a sweep by which no decision can change
 waits until the second or third one after it, and then they are taken one after the other.
 
@@ -33,6 +39,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.compensation import NO_GAIN, THERMAL_TAXEL
 from skin_host.processing.conversions import CONVERSION_S, YOUNG_S
+from skin_host.processing.erratic import CALM_S, FASTEST_HZ, LEAST_OF_CHIP
 from skin_host.processing.masks import Mask, all_of, any_of, count_of
 from skin_host.processing.stuck import (
     MOST_RATE,
@@ -78,6 +85,13 @@ MOST_JUMP = 2.0
 NOISY_MEAN = 0.5
 CALM_MEAN = 0.1
 NOISE_MEMORY_CONVERSIONS = 8
+#: Boards that send more seldom than this read a hand's fastest taps less than three times each.
+SLOW_S = 1.0 / (3.0 * FASTEST_HZ)
+#: Of their triangles a step is a press, or its end, where so many pads make a far one in its
+#: direction, and so many times as many as in the other. Ten pads that read what they like do that
+#: in one step of ten.
+TOGETHER_PADS = 3
+TOGETHER_RATIO = 4
 #: A pad has jumped lately while that mean is above this: for some 25 conversions.
 LATELY_MEAN = 0.01
 #: So many sweeps may wait where no step is far: a jump takes two far steps, and noise two jumps.
@@ -127,7 +141,8 @@ class Liveness:
         unproven: bool[k], triangles that had an error, or were frozen, and have not changed
             enough since; at first all.
         silenced: bool[k], those of them whose last reason was an error.
-        noisy: bool[k, 12], pads that jump up and down much more than when calibrated.
+        noisy: bool[k, 12], pads that jump up and down much more than when calibrated, and those of
+            chips of slow boards whose connection is broken.
         doubted: bool[k, 12], pads that are not valid, or None if all are. Of a noisy temperature
             pad those that its board compensates with it are not.
         lifeless: bool[k, 12], doubted pads whose bytes show nothing of the skin, or None if none
@@ -180,6 +195,19 @@ class Liveness:
         self._jump = np.where(known, np.maximum(NOISY_UNITS, NOISY_SIGMAS * most), np.inf)
         #: Steps are whole units, at most 255.
         self._jump_units = np.minimum(np.floor(self._jump), 255.0).astype(np.uint8)
+        self._slow: Mask = period_s > SLOW_S
+        self._any_slow = any_of(self._slow)
+        #: Pads whose steps show what presses. A board takes the noise of the other off them.
+        self._feels: Mask = np.ones(shape, np.bool_)
+        self._feels[:, THERMAL_TAXEL] = ~self._compensated.any(axis=1)
+        #: Pads whose noise under pressure is known, and how many noisy ones show a broken chip;
+        #: for how many sweeps it is then taken for broken, and how many of them are left.
+        self._judged: Mask = known & (pressed_units is not None)
+        if pressed_units is not None:
+            self._judged &= ~np.isnan(pressed_units)
+        self._enough = np.maximum(count_of(self._judged) // 2 + 1, LEAST_OF_CHIP)
+        self._calm_sweeps: Floats = CALM_S / period_s
+        self._broken_left = np.zeros(k)
         self._spike = np.maximum(SPIKE_UNITS, SPIKE_SIGMAS * noise_units)
 
         self._raw = np.zeros(shape, np.uint8)
@@ -232,6 +260,8 @@ class Liveness:
         self.silenced: Mask = np.zeros(k, np.bool_)
         self.noisy: Mask = np.zeros(shape, np.bool_)
         self._any_noisy = False
+        #: The pads that are noisy themselves.
+        self._jumps: Mask = np.zeros(shape, np.bool_)
         self.doubted: Mask | None = None
         self.lifeless: Mask | None = None
         self.spikes = np.zeros(shape, np.int64)
@@ -407,7 +437,7 @@ class Liveness:
                     array[chosen] = getattr(its, name)[chosen]
         self._repeats.keep(before._repeats, rows)
         self._any_step_left = self._most_step_sweeps
-        self._any_jumping = any_of(self._jumping > 0.0)
+        self._any_jumping = any_of(self._jumping > 0.0) or any_of(self._broken_left > 0.0)
         self._any_noisy = any_of(self.noisy)
         # Those that live have shown it to the predecessor.
         self._to_show = np.maximum(np.where(constant, PROBATION_CHANGES, 0), before._to_show)
@@ -500,6 +530,8 @@ class Liveness:
             up = raw > self._raw
             if self._any_step_left:
                 jump = far & (self._step_left > 0) & (up ^ self._step_up)
+                if self._any_slow:
+                    jump &= ~self._moved_together(far, up)
         here = None if whole else compared
         if jump is not None and any_of(jump):
             self._count_jumps(jump, size, here)
@@ -518,6 +550,18 @@ class Liveness:
             np.copyto(self._step_left, self._step_sweeps, where=far)
             np.copyto(self._step_size, size, where=far)
             np.copyto(self._step_up, up, where=far)
+
+    def _moved_together(self, far: Mask, up: Mask) -> Mask:
+        """Return which far steps, bool[k, 12], most pads of a triangle that is read seldom make,
+        up or down.
+        """
+        felt = far & self._feels
+        rise = count_of(felt & up)[:, None]
+        fall = count_of(felt)[:, None] - rise
+        same, other = np.where(up, rise, fall), np.where(up, fall, rise)
+        found: Mask = felt & self._slow[:, None]
+        found &= (same >= TOGETHER_PADS) & (same >= TOGETHER_RATIO * other)
+        return found
 
     def _count_jumps(self, jump: Mask, size: NDArray[np.uint8], compared: Mask | None) -> None:
         """Take far steps, bool[k, 12], of so many units each, that went back from a far one."""
@@ -559,8 +603,21 @@ class Liveness:
             self._jumping += jumped / NOISE_MEMORY_CONVERSIONS
         self._jumping[self._jumping < 1e-3] = 0.0
         self._any_jumping = any_of(self._jumping > 0.0)
-        self.noisy = self._jumping > np.where(self.noisy, CALM_MEAN, NOISY_MEAN)
+        self.noisy = self._jumps = self._jumping > np.where(self._jumps, CALM_MEAN, NOISY_MEAN)
+        if self._any_slow:
+            self._note_broken(compared)
         self._any_noisy = any_of(self.noisy)
+
+    def _note_broken(self, compared: Mask | None) -> None:
+        """Take all pads of a slow board's chip for noisy while most are, and for a time after."""
+        passed = 1 if compared is None else compared
+        np.maximum(self._broken_left - passed, 0.0, out=self._broken_left)
+        broken = self._slow & (count_of(self._jumps & self._judged) >= self._enough)
+        np.copyto(self._broken_left, self._calm_sweeps, where=broken)
+        broken = self._broken_left > 0.0
+        if any_of(broken):
+            self._any_jumping = True
+            self.noisy = self._jumps | (broken[:, None] & self._feels)
 
     def _learn(self) -> None:
         """Update the rates of boards with enough samples, for triangles that live."""

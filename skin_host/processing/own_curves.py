@@ -66,6 +66,8 @@ class OwnCurves:
         #: Which were touched since the last fold.
         self._felt: Mask = np.zeros(m, np.bool_)
         self._touching = False
+        #: Which were valid in the last sweep, but for the bytes that `without_rails` leaves out.
+        self._present: Mask = np.ones(m, np.bool_)
         #: Of the samples since the last fold, the time since the one before each.
         self._steps_s: list[float] = []
 
@@ -156,6 +158,7 @@ class OwnCurves:
             # Plays do not move under a reading that they had: those apart stay as they are.
             self._take_back()
             self._memory.step(self._smoother.smooth, elapsed_s, relaxation_kpa)
+        self.erratic.note_valid(self._present)
         self.erratic.pass_time(elapsed_s)
 
     def _report(self, relaxation_kpa: Floats) -> None:
@@ -226,6 +229,7 @@ class OwnCurves:
             before: uint8[m], the last readings.
             touched: bool[m], taxels that were touched by these, or may have been.
         """
+        self._present = present
         data = raw.tobytes()
         if 0 not in data and 255 not in data:
             return present

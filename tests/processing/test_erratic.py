@@ -180,6 +180,26 @@ def test_no_pad_of_a_chip_is_read_while_most_of_them_jump(
     assert np.flatnonzero(of_chips(*jumping_pads).pads).tolist() == erratic
 
 
+def test_pads_of_a_chip_that_are_not_valid_for_another_reason_decide_nothing_of_it():
+    """They cannot jump: what is not valid is taken as unchanged."""
+    found = Erratic(np.full(10, STEP_KPA), np.full(10, np.inf), np.repeat(0, 10))
+    valid = np.arange(10) < 5
+    rows = np.zeros((8, 10), np.float32)
+    rows[1::2, [0, 1, 2]] = 9.0
+    erratic = []
+    for second in range(8):
+        found.look(rows, [PERIOD_S] * len(rows))
+        # One lost sweep of the others shows nothing.
+        found.note_valid(np.ones(10, np.bool_) if second < 4 and second % 2 else valid)
+        found.pass_time(1.0)
+        erratic.append(np.flatnonzero(found.pads).tolist())
+    assert erratic[4] == [0, 1, 2]
+    assert erratic[-1] == list(range(10))
+    found.note_valid(np.ones(10, np.bool_))
+    found.pass_time(1.0)
+    assert np.flatnonzero(found.pads).tolist() == [0, 1, 2]
+
+
 def test_pads_of_a_chip_are_read_again_as_soon_as_few_of_them_are_erratic():
     found = of_chips(0, 1)
     found.pass_time(30.0)

@@ -1054,3 +1054,91 @@ def test_sweeps_that_wait_change_no_decision_and_nothing_that_is_learnt(
     assert np.array_equal(waits._rate, takes._rate)
     assert np.array_equal(waits._pads.longest, takes._pads.longest)
     assert waited or harm
+
+
+SLOW_PERIODS_S = (0.1, 0.2)
+
+
+def slow(period_s: float, pressed_units: np.ndarray | None = None) -> Liveness:
+    return Liveness(K, np.full((K, 12), 0.4), period_s, pressed_units=pressed_units)
+
+
+@pytest.mark.parametrize("period_s", SLOW_PERIODS_S)
+@pytest.mark.parametrize("contact_share", [0.3, 0.5, 0.7])
+@given(hz=st.floats(0.5, 4.9), pads=st.sampled_from([3, 6, 12]), seed=st.integers(0, 99))
+@settings(max_examples=10, deadline=None)
+def test_pads_that_a_hand_taps_are_not_noisy_however_seldom_they_are_read(
+    period_s: float, contact_share: float, hz: float, pads: int, seed: int
+) -> None:
+    """They rise and fall from sweep to sweep, and together."""
+    rng, liveness = np.random.default_rng(seed), slow(period_s)
+    tapped = np.arange(12) < pads
+    for sweep in range(100):
+        depth = 15.0 * (sweep * period_s * hz % 1.0 < contact_share) * rng.uniform(0.7, 1.0)
+        centre = 240.0 - np.where(tapped, depth, 0.0) * np.linspace(0.6, 1.0, 12)
+        liveness.step(noisy_bytes(rng, 0.4, np.tile(centre, (K, 1))), HERE, NO)
+        assert not liveness.noisy.any()
+
+
+@pytest.mark.parametrize("period_s", SLOW_PERIODS_S)
+@pytest.mark.parametrize("jumping_pads", [1, 2])
+@pytest.mark.parametrize("seed", range(5))
+def test_few_pads_that_jump_are_noisy_for_slow_boards_too(
+    period_s: float, jumping_pads: int, seed: int
+) -> None:
+    rng, liveness = np.random.default_rng(seed), slow(period_s)
+    for _ in range(60):
+        raw = noisy_bytes(rng, 0.4, np.full((K, 12), 200.0))
+        raw[0, :jumping_pads] -= rng.choice([0, 30], jumping_pads).astype(np.uint8)
+        liveness.step(raw, HERE, NO)
+    assert np.argwhere(liveness.noisy).tolist() == [[0, pad] for pad in range(jumping_pads)]
+
+
+@pytest.mark.parametrize("period_s", SLOW_PERIODS_S)
+def test_a_temperature_pad_that_a_slow_board_takes_off_the_others_is_noisy_although_they_follow(
+    period_s: float,
+) -> None:
+    rng = np.random.default_rng(2)
+    repeats = Repeats([Encoding(GAIN, 2, 240, truncates=False)] * K)
+    liveness = Liveness(K, np.full((K, 12), 0.4), period_s, repeats)
+    for _ in range(60):
+        raw = noisy_bytes(rng, 0.4, np.full((K, 12), 200.0))
+        raw[1] -= np.uint8(rng.choice([0, 30]))
+        liveness.step(raw, HERE, NO)
+    assert liveness.noisy[1, THERMAL_TAXEL]
+    assert liveness.doubted is not None
+    assert liveness.doubted[1, np.array(GAIN) > 0].all()
+
+
+def jumped(liveness: Liveness, pads: int, period_s: float, seconds: float = 20.0) -> Mask:
+    """Which are noisy after so many pads of one triangle have read what they like."""
+    rng = np.random.default_rng(4)
+    for _ in range(round(seconds / period_s)):
+        raw = noisy_bytes(rng, 0.4, np.full((K, 12), 200.0))
+        raw[1, :pads] -= rng.integers(0, 60, pads).astype(np.uint8)
+        liveness.step(raw, HERE, NO)
+    return liveness.noisy.copy()
+
+
+@pytest.mark.parametrize("period_s", [0.05, *SLOW_PERIODS_S])
+def test_no_pad_of_a_slow_boards_chip_is_read_while_most_are_noisy_and_for_a_minute_after(
+    period_s: float,
+) -> None:
+    known, whole = np.full((K, 12), 0.5), period_s > 0.05
+    assert jumped(slow(period_s, known), 6, period_s)[1].sum() == 6
+    liveness = slow(period_s, known)
+    assert jumped(liveness, 7, period_s)[1].all() == whole
+    after = slow(period_s, known)
+    after.keep(liveness, np.ones(1, np.bool_))
+    for one in (liveness, after):
+        still = jumped(one, 0, period_s, 55.0)
+        assert np.argwhere(still).tolist() == [[1, pad] for pad in range(12) if whole]
+        assert not jumped(one, 0, period_s, 10.0).any()
+        assert one.doubted is None
+
+
+def test_pads_whose_noise_under_pressure_is_not_known_do_not_show_a_broken_chip() -> None:
+    known = np.where(np.arange(12) < 6, np.nan, np.full((K, 12), 0.5))
+    assert jumped(slow(0.2), 9, 0.2)[1].sum() == 9
+    assert jumped(slow(0.2, known), 9, 0.2)[1].sum() == 9
+    assert jumped(slow(0.2, known), 10, 0.2)[1].all()

@@ -7,7 +7,12 @@ from hypothesis import strategies as st
 
 from skin_host.evaluation.rig import Rig
 from skin_host.processing.conversions import CONVERSION_S
-from skin_host.processing.scatter import LONGEST_S, MEMORY_CONVERSIONS, Scatter
+from skin_host.processing.scatter import (
+    LONGEST_BESIDE_S,
+    LONGEST_S,
+    MEMORY_CONVERSIONS,
+    Scatter,
+)
 from tests.processing.fitting.test_course import use_own_curves
 
 #: A pad of the usual units: one is 8 kPa, and a step of 8 units is six deviations of its noise.
@@ -23,12 +28,17 @@ def look(scatter: Scatter, rows: np.ndarray, period_s: float = 0.05) -> list[int
     return scatter.look(rows, [period_s] * len(rows), rows.max(axis=0)).tolist()
 
 
+def watching(m: int, range_kpa: float = RANGE_KPA, step_kpa: float = STEP_KPA) -> Scatter:
+    """Pads of one chip."""
+    every = np.ones(m, np.float32)
+    return Scatter(step_kpa * every, range_kpa * every, np.roll(np.arange(m), -1))
+
+
 def found(
     kpa: np.ndarray, period_s: float, range_kpa: float = RANGE_KPA, step_kpa: float = STEP_KPA
 ) -> set[int]:
     """Which of the pads [t, m] are found at any time, looked at as the pipeline does."""
-    m = kpa.shape[1]
-    scatter = Scatter(np.full(m, step_kpa, np.float32), np.full(m, range_kpa, np.float32))
+    scatter = watching(kpa.shape[1], range_kpa, step_kpa)
     rows = kpa.astype(np.float32)
     pads: set[int] = set()
     for begin in range(0, len(rows) - 7, 8):
@@ -202,11 +212,62 @@ def test_what_scatters_within_its_range_is_not_found():
     assert not found(kpa, 0.05, range_kpa=np.inf)
 
 
-def test_readings_too_far_apart_for_one_move_of_a_hand_are_not_compared():
+def test_readings_too_far_apart_for_one_move_of_a_hand_show_a_broken_chip_but_no_single_pad():
     rng = np.random.default_rng(3)
     kpa = 450.0 + 12.0 * UNIT_KPA * rng.normal(size=(600, PADS))
-    assert found(kpa, LONGEST_S) == set(range(PADS))
-    assert not found(kpa, LONGEST_S + 0.001)
+    every, alone = set(range(PADS)), kpa.copy()
+    alone[:, 1:] = 450.0
+    assert found(kpa, LONGEST_S) == every
+    assert found(alone, LONGEST_S) == {0}
+    assert found(kpa, LONGEST_S + 0.001) == found(kpa, LONGEST_BESIDE_S) == every
+    assert not found(alone, LONGEST_S + 0.001)
+    assert not found(kpa[:, :1], LONGEST_S + 0.001)
+    assert not found(kpa, LONGEST_BESIDE_S + 0.001)
+
+
+#: Of pads that one press moves: by how much each takes part in it.
+GAINS = {
+    "alike": np.ones(PADS),
+    "less at its edge": np.linspace(0.4, 1.0, PADS),
+    "rocking": np.linspace(-1.0, 1.0, PADS),
+}
+
+
+@pytest.mark.parametrize("gains", GAINS)
+@pytest.mark.parametrize("period_s", [0.13, 0.2, 0.25])
+@given(seed=st.integers(0, 1000), hz=st.floats(0.3, 5.0), irregular=st.booleans())
+@settings(max_examples=10, deadline=None)
+def test_a_press_beyond_the_range_that_moves_the_pads_of_a_chip_together_is_no_scatter(
+    period_s: float, gains: str, seed: int, hz: float, irregular: bool
+):
+    """However often it moves to and fro between two sweeps, and without any release."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(400) * period_s
+    wave = rng.normal(size=400) if irregular else np.sqrt(2.0) * np.sin(2.0 * np.pi * hz * t_s)
+    moves = 100.0 * np.clip(wave, -1.5, 1.5)
+    kpa = 450.0 + moves[:, np.newaxis] * GAINS[gains] + NOISE_KPA * rng.normal(size=(400, PADS))
+    assert not found(kpa, period_s)
+
+
+@pytest.mark.parametrize("period_s", [0.13, 0.2])
+@pytest.mark.parametrize("hz", [1.0, 2.0, 3.0, 4.5, 6.5])
+@pytest.mark.parametrize("kind", ["taps", "sliding"])
+def test_slow_boards_show_no_scatter_where_presses_end(kind: str, hz: float, period_s: float):
+    assert not found(measured(kind, hz, period_s, seconds=120.0), period_s)
+
+
+def test_a_lost_sweep_costs_no_more_than_the_readings_beside_it():
+    """A pad of quick boards is found by its own readings all the same."""
+    rng = np.random.default_rng(3)
+    kpa = 450.0 + 12.0 * UNIT_KPA * rng.normal(size=(600, PADS))
+    kpa[:, 1:] = 450.0
+    scatter, pads = watching(PADS), set()
+    steps_s = np.where(np.arange(600) % 9 == 8, 0.2, 0.1)
+    for begin in range(0, 600, 8):
+        rows = kpa[begin : begin + 8].astype(np.float32)
+        steps = steps_s[begin : begin + 8].tolist()
+        pads.update(scatter.look(rows, steps, rows.max(axis=0)).tolist())
+    assert pads == {0}
 
 
 def scattering(rng: np.random.Generator, samples: int) -> np.ndarray:
@@ -216,7 +277,7 @@ def scattering(rng: np.random.Generator, samples: int) -> np.ndarray:
 
 def looked_at() -> Scatter:
     """Two pads that scatter and are nearly found."""
-    scatter = Scatter(np.full(2, STEP_KPA, np.float32), np.full(2, RANGE_KPA, np.float32))
+    scatter = watching(2)
     rng = np.random.default_rng(1)
     rows = scattering(rng, 400)
     for begin in range(0, 400, 4):
@@ -230,7 +291,7 @@ def test_a_pad_is_found_as_soon_however_many_samples_are_looked_at_together(toge
     rows = scattering(np.random.default_rng(4), 400)
 
     def found_after(count: int) -> int:
-        scatter = Scatter(np.full(2, STEP_KPA, np.float32), np.full(2, RANGE_KPA, np.float32))
+        scatter = watching(2)
         for begin in range(0, 400, count):
             if look(scatter, rows[begin : begin + count]):
                 return begin + count
@@ -260,7 +321,7 @@ def test_a_pad_that_reads_steadily_again_is_not_found_any_more():
 
 def test_samples_that_come_one_by_one_are_judged_like_those_that_come_together():
     rows = scattering(np.random.default_rng(4), 640)
-    each = [Scatter(np.full(2, STEP_KPA, np.float32), np.zeros(2, np.float32)) for _ in range(2)]
+    each = [watching(2, range_kpa=0.0) for _ in range(2)]
     many = [look(each[0], rows[k : k + 8]) for k in range(0, 640, 8)]
     few = [look(each[1], rows[k : k + 1]) for k in range(640)][7::8]
     assert [0, 1] in many
