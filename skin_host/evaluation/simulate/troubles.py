@@ -731,13 +731,16 @@ def _board_latched(world: World, chance: random.Random, _: bool) -> Trouble:
 
 
 def _disk_slow(world: World, chance: random.Random, _: bool) -> Trouble:
-    """Each file takes long; everything else goes on meanwhile."""
+    """Each file takes long; everything else goes on meanwhile. A connection to the broker begins
+    with the files of its passwords and certificates, and events wait for it.
+    """
     world.clock.threads_take_s = round(chance.uniform(0.1, 3.0), 2)
 
     def end() -> None:
         world.clock.threads_take_s = 0.0
 
-    return Trouble("disk_slow", f"disk_slow {world.clock.threads_take_s:g} s", end)
+    about = f"disk_slow {world.clock.threads_take_s:g} s"
+    return Trouble("disk_slow", about, end, {"broker_away", "touches_dropped"})
 
 
 def damaged_set_up(world: World, place: Triangle) -> Trouble:

@@ -349,6 +349,29 @@ def test_a_slow_disk_does_not_make_touches_last_when_the_daemon_ends(world: Worl
         assert runner.run(live()) == b"UNKNOWN"
 
 
+def test_events_that_wait_for_a_slow_disk_before_the_broker_are_lost_with_a_cause(
+    world: World,
+) -> None:
+    """`small.toml` 9032, `--hours 1`: the daemon started on a slow disk, and noise made touches."""
+
+    async def live() -> None:
+        promises = Promises(world)
+        trouble = KINDS["disk_slow"](world, random.Random(1), True)
+        world.clock.threads_take_s = 3.0
+        life = start(world)
+        await world.clock.sleep(2.9)
+        assert not life.daemon.publisher.counters.connected
+        await world.clock.sleep(0.2)
+        assert life.daemon.publisher.counters.connected
+        assert not promises.accusations._has_cause("touches_dropped", "broker")
+        promises.begin(trouble)
+        assert promises.accusations._has_cause("touches_dropped", "broker")
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
 def test_nothing_is_felt_by_boards_that_are_set_up_while_the_daemon_ends(world: World) -> None:
     """`gripper.toml` 9071: a board's set-up reads its bus first, and a touch began without an end,
     while a slow disk kept the daemon from ending.
