@@ -31,8 +31,9 @@ MAX_RUNNING = 8
 BURST = 20
 PER_SECOND = 10.0
 
-#: Of what others wrote, so many characters are logged.
+#: Of what others wrote, so many characters are logged, and so many retained requests are named.
 LOGGED = 200
+MAX_NAMED = 16
 
 #: Why a command was not carried out: the request is wrong, and is refused until it is mended; it is
 #: right, but came at a wrong moment, and nothing was done; or it failed, and a part may be done.
@@ -110,7 +111,8 @@ class CommandHandler:
         self._tokens = float(BURST)
         self._filled_s: float | None = None
         self._flooded = False
-        self._met_retained = False
+        #: Topics of retained requests that were named.
+        self._named: set[str] = set()
         self._ending = False
         self.taken = 0
         self.refused = 0
@@ -142,8 +144,8 @@ class CommandHandler:
 
     def ignore_retained(self, topic: str) -> None:
         """Count a request that was published as retained: it may be from any time."""
-        if not self._met_retained:
-            self._met_retained = True
+        if topic not in self._named and len(self._named) < MAX_NAMED:
+            self._named.add(topic)
             _log.warning(
                 "a retained request on %s is ignored; clear it with: mosquitto_pub -r -n -t %s",
                 *[visible(topic, LOGGED)] * 2,

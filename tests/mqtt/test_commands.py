@@ -18,6 +18,7 @@ from skin_host.errors import (
     StateError,
 )
 from skin_host.mqtt.commands import (
+    MAX_NAMED,
     MAX_REQUEST_BYTES,
     MAX_RUNNING,
     RESULT_SCHEMA,
@@ -177,3 +178,22 @@ async def test_commands_that_a_disk_holds_up_leave_room_for_every_other_command(
     ask("disable")
     await clock.sleep(1.0)
     assert received[-1].ok
+
+
+async def never(name: str, payload: bytes) -> Mapping[str, Any]:
+    raise AssertionError("the handler is not to be asked")
+
+
+def test_each_retained_request_is_named_with_what_clears_it_but_not_a_flood_of_them(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    handler = CommandHandler(never)
+    topics = [f"skin/robot/nodes/main/cmd/{name}" for name in ("zero", "reload", "zero")]
+    for topic in topics:
+        handler.ignore_retained(topic)
+    said = [record.getMessage() for record in caplog.records]
+    assert [line.rpartition("mosquitto_pub -r -n -t ")[2] for line in said] == topics[:2]
+    for number in range(1000):
+        handler.ignore_retained(f"skin/robot/nodes/main/cmd/{number}")
+    assert len(caplog.records) == MAX_NAMED
+    assert handler.refused == 1003

@@ -288,6 +288,10 @@ function staleText(stale) {
   return uncalibrated.length === stale.length ? `${named(stale)}: not calibrated` : `no data from ${named(stale)}`;
 }
 
+function liveText(taxels) {
+  return `live, ${taxels} ${taxels === 1 ? "taxel" : "taxels"}`;
+}
+
 function showStatus(nowMs) {
   const status = $("status");
   // A node whose parts others have now may be offline for ever.
@@ -301,7 +305,7 @@ function showStatus(nowMs) {
   else if (offline) [text, level] = [`node ${offline} is offline`, "alarm"];
   else if (stale.length) [text, level] = [staleText(stale), "alarm"];
   else if (unknown) [text, level] = [`not known whether node ${unknown} is online`, "wait"];
-  else text = `live, ${store.parts.reduce((sum, part) => sum + part.n, 0)} taxels`;
+  else text = liveText(store.parts.reduce((sum, part) => sum + part.n, 0));
   status.dataset.level = level;
   if (status.textContent !== text) status.textContent = text;
   const banner = $("banner");
