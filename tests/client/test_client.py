@@ -110,7 +110,7 @@ async def test_state_is_known_with_the_next_health_and_then_to_who_asks_later(
     async with publishing(mosquitto) as publisher:
         publisher.put_contact("palm", "ON")
         publisher.put_health("palm", {"rate_hz": 20.0})
-        await until(lambda: publisher.counters.retained_sent >= 3)
+        await until(lambda: not publisher._outbox.pending)
         async with hearing(mosquitto, stale_s=10 * PATIENCE_S) as skin:
             first, health = skin.contacts(), skin.health()
             (seen,) = await take(health, 1)
