@@ -134,6 +134,11 @@ class TipState:
         many = self.assembler is not None and self.assembler.twice
         return many and self.keeps_period is not False
 
+    @property
+    def trusted(self) -> bool:
+        """Whether its samples change, and are of one board."""
+        return self.frozen.trusted and not self.twice
+
     def lately(self, at_ns: int | None) -> bool:
         """Whether what came at a time, by the ledger's clock, is of what the board sends now."""
         return at_ns is not None and self.received_ns - at_ns < self.tip.lost_ns
@@ -349,8 +354,7 @@ class FingertipEngine:
         self._zeroing = False
         found = {}
         for name, state in self.tips.items():
-            trusted = state.frozen.trusted and not state.twice
-            if len(state.zeroing) >= FEWEST_SAMPLES and trusted:
+            if len(state.zeroing) >= FEWEST_SAMPLES and state.trusted:
                 assert state.assembler is not None
                 samples = np.array(state.zeroing)
                 whole = ~damaged(samples, state.assembler.full_scale / ZERO_WORD)
@@ -392,7 +396,7 @@ class FingertipEngine:
         events: list[FingertipEvent] = []
         load = state.agreement.take(wrench)
         state.frozen.take(wrench)
-        trusted = state.frozen.trusted and not state.twice
+        trusted = state.trusted
         if not trusted or state.exchanged:
             events = state.tip.lose(wrench.t_ns)
             self._note_touch(state)

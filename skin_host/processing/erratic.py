@@ -73,7 +73,7 @@ class Erratic:
         #: At how many looks each pad was last not valid.
         self._missed = np.zeros(m, np.int8)
         self._step = step_kpa.astype(np.float32)
-        beside = next_of_chip(self._chip, np.isfinite(step_kpa))
+        beside = next_of_chip(self._chip, self._known)
         self._scatter = Scatter(self._step, range_kpa.astype(np.float32), beside)
         self._score = np.zeros(m, np.float32)
         self._left_s = np.zeros(m)
@@ -147,7 +147,7 @@ class Erratic:
                 np.bincount(self._chip[pads], minlength=len(self.pads))
                 for pads in (self.pads, judged)
             )
-            broken: Mask = found >= np.maximum(of_chip // 2 + 1, LEAST_OF_CHIP)
+            broken: Mask = found >= most_of(of_chip)
             if broken.any():
                 np.logical_or(self.pads, broken[self._chip], out=self.pads)
 
@@ -202,6 +202,11 @@ class Erratic:
         if self.any:
             self._left_s -= dt_s
             self._mark()
+
+
+def most_of(pads: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return how many of so many pads of a chip show that its connection is broken."""
+    return np.maximum(pads // 2 + 1, LEAST_OF_CHIP)
 
 
 def next_of_chip(chip: NDArray[np.intp], watched: Mask) -> NDArray[np.intp]:

@@ -42,6 +42,7 @@ FAR_SHARE = 1.5
 #: stays so until it has not for as long: which of its sweeps show it is up to noise.
 AGAIN_NS = 1_000_000_000
 AGAIN_PERIODS = 10
+LONG_AGO_NS = -1 << 60
 
 
 class PartSample(NamedTuple):
@@ -150,12 +151,12 @@ class Intake:
         self._vetoed: dict[int, tuple[tuple[Mask, Mask], bytes, tuple[Mask, Mask]]] = {}
         #: When each triangle read like another chip's last, and until when its readings are not
         #: taken for that, on the ledger's clock; by row the last of these.
-        self._another_ns = np.full((n, TRIANGLES), -1 << 60, np.int64)
+        self._another_ns = np.full((n, TRIANGLES), LONG_AGO_NS, np.int64)
         self._untaken_ns = self._another_ns.copy()
         self._until_ns = [0] * n
-        periods_ms = [layout.boards[board].settings.period_ms for board in boards]
         self._again_ns = [
-            max(AGAIN_NS, AGAIN_PERIODS * 1_000_000 * period_ms) for period_ms in periods_ms
+            max(AGAIN_NS, AGAIN_PERIODS * 1_000_000 * layout.boards[board].settings.period_ms)
+            for board in boards
         ]
         # What is not judged yet.
         self._waiting = np.zeros(n, np.bool_)
@@ -202,7 +203,7 @@ class Intake:
         for row in np.flatnonzero(boards).tolist():
             self.veto.pop(row, None)
             self.far_presses.forget(row)
-            self._untaken_ns[row] = self._another_ns[row] = -1 << 60
+            self._untaken_ns[row] = self._another_ns[row] = LONG_AGO_NS
             self._until_ns[row] = 0
 
     def go_on(self, before: "Intake") -> None:

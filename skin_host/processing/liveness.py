@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.compensation import NO_GAIN, THERMAL_TAXEL
 from skin_host.processing.conversions import CONVERSION_S, YOUNG_S
-from skin_host.processing.erratic import CALM_S, FASTEST_HZ, LEAST_OF_CHIP
+from skin_host.processing.erratic import CALM_S, FASTEST_HZ, most_of
 from skin_host.processing.masks import Mask, all_of, any_of, count_of
 from skin_host.processing.stuck import (
     MOST_RATE,
@@ -205,7 +205,7 @@ class Liveness:
         self._judged: Mask = known & (pressed_units is not None)
         if pressed_units is not None:
             self._judged &= ~np.isnan(pressed_units)
-        self._enough = np.maximum(count_of(self._judged) // 2 + 1, LEAST_OF_CHIP)
+        self._enough = most_of(count_of(self._judged))
         self._calm_sweeps: Floats = CALM_S / period_s
         self._broken_left = np.zeros(k)
         self._spike = np.maximum(SPIKE_UNITS, SPIKE_SIGMAS * noise_units)

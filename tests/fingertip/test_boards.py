@@ -106,6 +106,14 @@ class Bench:
         return [fault["code"].removeprefix("fingertip_") for fault in self.record(name)["faults"]]
 
 
+async def calibrated(*probes: dict[str, Any], noise: bool = True, **table: Any) -> Bench:
+    """A bench whose boards are set up, and calibrated."""
+    bench = Bench(*probes, noise=noise, **table)
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    return bench
+
+
 async def test_a_board_is_asked_for_its_full_scales_set_up_and_zeroed() -> None:
     bench = Bench()
     assert (bench.record()["state"], bench.codes()) == ("no data", [])
@@ -158,9 +166,7 @@ async def test_a_board_that_never_sends_is_absent_once_it_has_had_its_time() -> 
 
 
 async def test_metrics_tell_of_fingertips() -> None:
-    bench = Bench()
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated()
     page = metrics.exposition(bench.health.records(bench.robot.t_ns))
     assert 'skin_fingertip_touched{part="index"} 0' in page
     assert 'skin_faults{part="thumb"} 0' in page
@@ -171,9 +177,7 @@ async def test_a_board_that_sends_in_another_period_is_named_and_set_up_again(
     period_ms: int,
 ) -> None:
     """By the period slips are judged: at a third of it their rates are too low by three times."""
-    bench = Bench()
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated()
     assert bench.tips.tips["index"].keeps_period
     await bench.run(1.0)
     # Another program's.
@@ -194,9 +198,7 @@ async def test_a_board_that_sends_in_another_period_is_named_and_set_up_again(
 
 
 async def test_a_board_that_cannot_send_in_its_period_is_set_up_ever_more_seldom() -> None:
-    bench = Bench()
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated()
     board = bench.robot.fingertips.boards["index"]
     handle = board.handle
 
@@ -240,9 +242,7 @@ class TwoBoards:
 @pytest.mark.parametrize("phase_ms", [0.05, 0.15, 1.1, 1.5])
 async def test_two_boards_at_one_address_are_named_and_feel_nothing(phase_ms: float) -> None:
     """Their samples came in turns, as 300 touches a second of a fingertip that was well."""
-    bench = Bench()
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated()
     two = TwoBoards(bench, phase_ms)
     bench.sent.clear()
     await bench.run(4.5)
@@ -268,9 +268,7 @@ async def test_two_boards_at_one_address_are_named_and_feel_nothing(phase_ms: fl
 @pytest.mark.parametrize("pause_s", [0.3, 1.0, 3.0])
 async def test_what_waited_while_a_computer_was_busy_is_not_of_two_boards(pause_s: float) -> None:
     """As an adapter stamps it: all at the time of reading."""
-    bench = Bench()
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated()
     state = bench.tips.tips["index"]
     for _ in range(6):
         waited = bench.robot.step(pause_s)["can0"]
@@ -300,9 +298,7 @@ def test_samples_that_are_late_or_lost_are_not_of_another_period(
 
 
 async def test_a_board_that_falls_silent_is_told_of_and_set_up_again() -> None:
-    bench = Bench()
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated()
     mend = bench.robot.inject(parse("board_silent board=index"))
     await bench.run(0.3)
     assert (bench.record()["state"], bench.codes()) == ("silent", ["silent"])
@@ -361,9 +357,7 @@ async def test_a_touch_outlasts_a_lost_sample_of_a_slow_board() -> None:
 
 
 async def test_full_scales_that_somebody_else_reported_are_told_until_the_board_is_asked() -> None:
-    bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
     address = bench.tips.tips["index"].settings.address
     forged = answer_frame(FullScale(0, 7), address)
     bench.engine.feed("can0", FrameBatch.of([(*forged, bench.robot.t_ns)] * 2))
@@ -375,9 +369,7 @@ async def test_full_scales_that_somebody_else_reported_are_told_until_the_board_
 
 
 async def test_full_scales_that_are_given_are_used_and_compared() -> None:
-    bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
     assert bench.codes() == []
     bench.tips.tips["index"].reported_scale[2] = 2000.0
     assert bench.codes() == ["scale"]
@@ -477,9 +469,7 @@ async def test_a_board_that_does_not_tell_its_full_scales_is_not_configured() ->
     [(0, "frames are lost or late"), (48, "frames are lost or late"), (50, "come so far apart")],
 )
 async def test_lost_frames_are_told_until_none_is_lost(late: int, sentence: str) -> None:
-    bench = Bench()
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated()
     await bench.run(1.0)
     assembler = bench.tips.tips["index"].assembler
     assert assembler is not None
@@ -504,9 +494,7 @@ async def test_frames_of_a_wrong_length_count_for_the_board_that_sent_them() -> 
 
 
 async def test_load_beyond_the_range_is_told_and_has_no_place() -> None:
-    bench = Bench({"part": "index", "force_n": [[2.5, 0], [2.6, 60], [4, 60], [4.1, 0]]})
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated({"part": "index", "force_n": [[2.5, 0], [2.6, 60], [4, 60], [4.1, 0]]})
     await bench.run(2.5)
     assert (bench.record()["state"], bench.codes()) == ("saturated", ["saturated"])
     told = [event for event in bench.felt if event.part == "index"]
@@ -609,9 +597,7 @@ async def test_a_press_is_felt_with_its_second_sample_and_over_with_the_second_w
 async def test_damaged_frames_of_a_calibration_are_no_noise_of_a_board(
     bit: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench = Bench()
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated()
     whole = bench.record()["threshold_n"]
     step = bench.robot.step
     number = 0
@@ -734,9 +720,7 @@ async def test_what_is_felt_beyond_the_range_of_a_fingertip_that_does_not_feel_i
 
 
 async def test_noise_that_raises_the_threshold_beyond_the_range_is_not_felt_through() -> None:
-    bench = Bench()
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated()
     await bench.run(0.1)
     assert bench.contact() == "OFF"
     noisy = Zero(np.zeros(6), np.array([9.0, 9.0, 9.0, 0.1, 0.1, 0.1]))
@@ -832,9 +816,7 @@ async def contacts(bench: Bench, seconds: float) -> set[str]:
 async def test_a_board_that_repeats_its_bytes_from_the_start_is_never_free_nor_touched(
     pressed_n: float,
 ) -> None:
-    before = Bench()
-    await before.boards.bring_up()
-    await before.calibrate()
+    before = await calibrated()
     bench = Bench({"part": "index", "force_n": [[0.0, pressed_n], [99.0, pressed_n]]})
     latch = Latch(bench)
     latch.holds = True
@@ -1033,9 +1015,7 @@ async def test_single_frames_of_a_board_that_is_silent_are_no_sign_that_nothing_
 async def test_a_board_that_never_sends_whole_samples_is_named_once_it_has_had_its_time(
     missing: str,
 ) -> None:
-    before = Bench()
-    await before.boards.bring_up()
-    await before.calibrate()
+    before = await calibrated()
     bench = Bench()
     halves = Halves(bench, HALVES[missing], "lost")
     halves.acts = True
@@ -1172,9 +1152,7 @@ def test_noise_does_not_repeat_for_so_long_by_chance_and_is_soon_trusted(
 
 
 async def test_a_contact_without_end_makes_its_zero_uncertain() -> None:
-    bench = Bench({"part": "index", "force_n": [[2.5, 0], [2.6, 1], [6.5, 1], [6.6, 0]]})
-    await bench.boards.bring_up()
-    await bench.calibrate()
+    bench = await calibrated({"part": "index", "force_n": [[2.5, 0], [2.6, 1], [6.5, 1], [6.6, 0]]})
     bench.tips.held_report_ns = 2_000_000_000
     await bench.run(2.5)
     assert bench.codes() == []

@@ -3,6 +3,9 @@
 const SHOWN = { verdicts: "verdicts", touched: "pads that were touched", fingertips: "fingertips" };
 const AGAIN = "Take away what touches the skin and calibrate again.";
 
+/** So many taxels, in words. */
+export function inTaxels(n) { return `${n} ${n === 1 ? "taxel" : "taxels"}`; }
+
 /**
  * What the nodes that were asked have answered: the text, its level, and how long it is shown (ms).
  * `part` is the one that was calibrated, null for the whole skin.
@@ -11,7 +14,7 @@ export function calibrated(answers, part) {
   const errors = answers.filter(({ ok }) => !ok).map(({ error }) => error);
   const results = answers.filter(({ ok }) => ok).map(({ result }) => result);
   const touched = results.flatMap((result) => [
-    ...Object.entries(result.touched ?? {}).map(([name, { length }]) => `${length} ${length === 1 ? "taxel" : "taxels"} of ${name}`),
+    ...Object.entries(result.touched ?? {}).map(([name, { length }]) => `${inTaxels(length)} of ${name}`),
     ...Object.entries(result.fingertips ?? {}).filter(([, verdict]) => verdict === "touched").map(([name]) => name),
   ]);
   // From an answer that is larger than the broker takes, keys are left out.

@@ -1,5 +1,5 @@
 // Wiring: the WebSocket, the tools, the keys, and when to draw.
-import { calibrated } from "./calibrated.js";
+import { calibrated, inTaxels } from "./calibrated.js";
 import { DASHES, paper, ramp, shareOf, theme } from "./colours.js";
 import { SkinMap } from "./map.js";
 import { isLeast, put, showContacts, showHealth, showParts, told } from "./panels.js";
@@ -288,10 +288,6 @@ function staleText(stale) {
   return uncalibrated.length === stale.length ? `${named(stale)}: not calibrated` : `no data from ${named(stale)}`;
 }
 
-function liveText(taxels) {
-  return `live, ${taxels} ${taxels === 1 ? "taxel" : "taxels"}`;
-}
-
 function showStatus(nowMs) {
   const status = $("status");
   // A node whose parts others have now may be offline for ever.
@@ -305,7 +301,7 @@ function showStatus(nowMs) {
   else if (offline) [text, level] = [`node ${offline} is offline`, "alarm"];
   else if (stale.length) [text, level] = [staleText(stale), "alarm"];
   else if (unknown) [text, level] = [`not known whether node ${unknown} is online`, "wait"];
-  else text = liveText(store.parts.reduce((sum, part) => sum + part.n, 0));
+  else text = `live, ${inTaxels(store.parts.reduce((sum, part) => sum + part.n, 0))}`;
   status.dataset.level = level;
   if (status.textContent !== text) status.textContent = text;
   const banner = $("banner");
