@@ -44,7 +44,7 @@ class Hearer(Protocol):
         """Find out what must be known before the first subscription."""
 
     def wanted(self) -> Iterable[str]:
-        """Return the topics to subscribe to."""
+        """Return the topics to subscribe to, in that order."""
 
     def take(self, link: "BrokerLink", message: Message) -> None:
         """Take a message."""
@@ -148,9 +148,11 @@ class BrokerLink:
     async def _keep_subscribed(self, connection: Connection) -> None:
         while True:
             self.again.clear()
-            want = set(self._hearer.wanted())
-            # Nodes first: what is retained of a part whose node has stopped is out of date.
-            for topic in sorted(want - self._subscribed, key=lambda one: "/nodes/" not in one):
+            wanted = list(self._hearer.wanted())
+            want = set(wanted)
+            for topic in wanted:
+                if topic in self._subscribed:
+                    continue
                 qos = 0 if topic.endswith("/frame") else 1
                 if not await connection.listen_to(topic, qos, as_published=False):
                     self.refused.add(topic)

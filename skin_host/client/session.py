@@ -692,7 +692,11 @@ class SkinClient:
         return {one for stream in here for kind in stream.kinds for one in needed(kind)}
 
     def wanted(self) -> Iterator[str]:
-        """Yield the topics to subscribe to; none contains another, or messages would come twice."""
+        """Yield the topics to subscribe to; none contains another, or messages would come twice.
+
+        Nodes come first: what is retained of a part whose node has stopped is out of date. Contact
+        states come before what shows that their part lives, or that would not be known of them.
+        """
         topics = self._topics
         if topics is None:
             return
@@ -706,7 +710,7 @@ class SkinClient:
             for asked_kind in stream.kinds
             for kind in needed(asked_kind)
         }
-        for kind, part in asked:
+        for kind, part in sorted(asked, key=lambda one: one[0] != "contact"):
             if part is None or (kind, None) not in asked:
                 yield topics.part(kind, "+" if part is None else part)
 

@@ -124,6 +124,23 @@ async def test_state_is_known_with_the_next_health_and_then_to_who_asks_later(
             assert (await take(later, 1))[0].stored
 
 
+async def test_contact_states_are_subscribed_to_before_what_shows_that_their_parts_live(
+    mosquitto: Mosquitto,
+) -> None:
+    """What is live may come before what is retained of a later subscription, and would show nothing
+    of a state that is not known yet.
+    """
+    parts = [f"part{i}" for i in range(8)]
+    async with hearing(mosquitto) as skin:
+        streams = [kind(part) for part in parts for kind in (skin.health, skin.contacts)]
+        await skin.ready()
+        for stream in streams:
+            stream.close()
+    asked = [line.rsplit("/", 1)[-1] for line in mosquitto.log.splitlines() if "/part" in line]
+    assert asked[:8] == ["contact"] * 8
+    assert sorted(asked[8:]) == ["health"] * 8 + ["touch"] * 8
+
+
 async def stored(broker: Mosquitto, **messages: bytes) -> None:
     """Leave retained messages of a part at the broker, as somebody who is not a node."""
     async with aiomqtt.Client(broker.host, broker.port) as stranger:
