@@ -58,6 +58,9 @@ LONGEST_FIRST = (
     "tests/evaluation/papers/test_contacts_report.py",
 )
 
+#: Of a failure after which a test is run again.
+LAST_LINES = 30
+
 # A slow machine is no failure.
 hypothesis.settings.register_profile("project", deadline=None, max_examples=40)
 # `make test-system` looks further: --hypothesis-profile=far.
@@ -108,6 +111,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if BROKERS & set(getattr(item, "fixturenames", ())):
             item.add_marker("mosquitto")
     items.sort(key=lambda item: _place(item.nodeid.partition("::")[0]))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Show why tests were run again: one that passes then shows nothing else of it."""
+    for report in terminalreporter.stats.get("rerun", ()):
+        terminalreporter.section(f"run again: {report.nodeid}", "_")
+        terminalreporter.write_line("\n".join(report.longreprtext.splitlines()[-LAST_LINES:]))
 
 
 def _place(file: str) -> int:

@@ -12,8 +12,10 @@ lost meanwhile. `SkinCallbacks` is the same without asyncio. All that they raise
 
 from skin_host.client.callbacks import SkinCallbacks
 from skin_host.client.heard import Described, Health
+from skin_host.client.nodes import Node
 from skin_host.client.presence import Contact
-from skin_host.client.session import CommandError, Node, SkinClient, WrongCommandError
+from skin_host.client.requests import CommandError, WrongCommandError
+from skin_host.client.session import SkinClient
 from skin_host.client.streams import Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.fingertip.events import Over, Slip

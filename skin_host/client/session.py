@@ -2,12 +2,9 @@
 
 import asyncio
 import contextlib
-import itertools
 import logging
-import math
 import secrets
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
@@ -15,13 +12,22 @@ from weakref import WeakSet
 from skin_host.client.absent import no_such_part, unpublished
 from skin_host.client.heard import Described, Health, is_online, read
 from skin_host.client.links import RETAINED_S, ROBOT_S, BrokerLink, only_robot, refusal
+from skin_host.client.nodes import MAX_NAMES, Node, Nodes
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import STALE_S, Contact, Presence
+from skin_host.client.requests import (
+    CommandError,
+    Request,
+    Requests,
+    answer_within_s,
+    refuse_wrong_name,
+)
 from skin_host.client.streams import Kind, Stream, refuse_other_loop
+from skin_host.client.subscriptions import Subscriptions
 from skin_host.errors import BrokerError, RequestError, SkinError, visible
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.commands import Result, decode_result, encode_request
+from skin_host.mqtt.commands import decode_result
 from skin_host.mqtt.connection import (
     Connection,
     Message,
@@ -29,28 +35,22 @@ from skin_host.mqtt.connection import (
     explain,
     message_properties,
 )
-from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
+from skin_host.mqtt.info import NodeInfo
 from skin_host.mqtt.messages import Frame
-from skin_host.mqtt.order import Stamp, parts_of, run_of, stamp_of
+from skin_host.mqtt.order import parts_of, run_of, stamp_of
 from skin_host.mqtt.payload import JSON_TYPE, MessageError
-from skin_host.mqtt.topics import NAME, PartTopic, Topics, wrong_part
+from skin_host.mqtt.topics import PartTopic, Topics, wrong_part
 from skin_host.processing.events import Touch
 from skin_host.tasks import cancel
 
 #: An event waits this long for an earlier one, which may come from another broker: as long as a
 #: robot sends events again there (`mqtt.outbox.REPEAT_S`). Only after an earlier one is missing.
 HOLD_S = 10.0
-#: No robot has so many parts, nor so many nodes; messages of more than these are passed over.
-MAX_NAMES = 256
-#: Of the infos of all its nodes; an iCub's has 0.4 MB.
-MAX_INFO_BYTES = 32 * 1024 * 1024
 #: Daemons find a broker that starts, or that comes back, within 3 s. This long after the last of
 #: them has named its parts there are no others.
 NAMED_S = 5.0
 #: No more reasons why messages are unreadable are logged.
 MOST_REASONS = 20
-#: A node answers a command within this time, and that for which the command lasts.
-ANSWER_S = 10.0
 #: Health comes once a second, and may come late: nothing could be called stale sooner.
 LEAST_STALE_S = 1.5
 #: Timeouts are checked this often.
@@ -58,51 +58,6 @@ WATCH_S = 0.25
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
-
-
-def needed(kind: Kind) -> tuple[PartTopic, ...]:
-    """Return the topics of parts that a stream of a kind needs: a contact state is valid only while
-    its part lives. Those of the nodes are always subscribed to.
-    """
-    if kind == "info":
-        return ()
-    return ("contact", "health", "touch") if kind == "contact" else (kind,)
-
-
-class CommandError(SkinError):
-    """A node refused a command, failed, or did not answer; the message gives the reason.
-
-    Attributes:
-        cause: the node's: `request`, `state` or `failure`, see `mqtt.commands.Cause`; None if it
-            did not answer, or named none as an earlier version does.
-    """
-
-    def __init__(self, message: str, cause: str | None = None) -> None:
-        super().__init__(message)
-        self.cause = cause
-
-
-class WrongCommandError(CommandError, RequestError):
-    """A node found a request wrong: a name, a key or a value of it (cause `request`)."""
-
-
-@dataclass
-class Node:
-    """A daemon of the robot. `online` is None while that is not known.
-
-    So it is until its status was received; without a broker; while the messages of all its parts
-    that are followed come too late or not at all; and, with several brokers, after its connection
-    ended without a word: it may have another one by then.
-    """
-
-    online: bool | None = None
-    info: NodeInfo | None = None
-    #: Whether the broker has its status.
-    has_status: bool = field(default=False, repr=False)
-    #: Pieces of its info, by number.
-    pieces: dict[int, NodeInfo] = field(default_factory=dict, repr=False)
-    #: Their lengths as messages, in bytes.
-    sizes: dict[int, int] = field(default_factory=dict, repr=False)
 
 
 class SkinClient:
@@ -120,7 +75,6 @@ class SkinClient:
             `contacts`; `LEAST_STALE_S` or more.
 
     Attributes:
-        nodes: the robot's daemons by name, as far as they have been received.
         connections: how often a broker was found; more than the number of brokers means that one
             was lost.
         last_error: why one was lost, or not found.
@@ -175,25 +129,18 @@ class SkinClient:
                 "second, and a part is not known in between otherwise"
             )
         self._base = base or "skin"
-        self._topics = None if robot is None else Topics(self._base, robot)
         self._robot = robot
         self._patience_s = patience_s
         self._identifier = f"skin-client-{secrets.token_hex(4)}"
-        self._numbers = itertools.count(1)
-        #: By number of the request: its answer, once it has come.
-        self._asked: dict[str, Result | None] = {}
+        self._requests = Requests(self._identifier)
         self._streams: WeakSet[Stream[Any]] = WeakSet()
         self._latest: dict[str, Health] = {}
-        #: The parts as they were described last, see `infos`.
-        self._described: dict[str, Described] = {}
         #: Names that were received: of parts, and of nodes.
         self._names: tuple[set[str], set[str]] = (set(), set())
-        self._info_bytes = 0
         self._presence = Presence(stale_s)
+        self._nodes = Nodes(self._presence)
         self._order = EventOrder(HOLD_S if len(brokers) > 1 else 0.0)
         self._newest = Newest()
-        #: When a node named its parts last.
-        self._named_s = -math.inf
         self._news = asyncio.Event()
         #: In which the client was entered.
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -204,14 +151,28 @@ class SkinClient:
             BrokerLink(i, one, self._identifier + f"-{i}" * (len(brokers) > 1), self)
             for i, one in enumerate(brokers)
         ]
-        self.nodes: dict[str, Node] = {}
+        #: None until the robot's name is known.
+        self._subscriptions = None if robot is None else self._subscriptions_of(robot)
         self.last_error = ""
         self.unreadable = 0
         self._unreadable_for: set[str] = set()
 
+    def _subscriptions_of(self, robot: str) -> Subscriptions:
+        topics = Topics(self._base, robot)
+        if self._links[0].broker.v5:
+            replies = topics.reply("+", self._identifier)
+        else:
+            replies = topics.result("+", "+")
+        return Subscriptions(topics, replies, self._streams)
+
     @property
     def robot(self) -> str:
         return self._robot or ""
+
+    @property
+    def nodes(self) -> dict[str, Node]:
+        """The robot's daemons by name, as far as they have been received."""
+        return self._nodes.known
 
     @property
     def connected(self) -> bool:
@@ -269,7 +230,7 @@ class SkinClient:
         missing = self._missing(part, _now_s())
         if missing is not None:
             raise RequestError(missing)
-        self._refuse_unread(self._topics_of("touch", part))
+        self._refuse_unread(lambda subscriptions: subscriptions.of("touch", part))
         return self._presence.touches(part, _now_s())
 
     def health(self, part: str | None = None) -> Stream[Health]:
@@ -288,13 +249,7 @@ class SkinClient:
 
         As far as they have been received: after `info()` those of all nodes that are online.
         """
-        found = {}
-        for part, node in self._presence.holders.items():
-            info = self.nodes[node].info if node in self.nodes else None
-            if info is not None:
-                described = info.parts.get(part) or info.fingertips.get(part)
-                found[part] = Described(part, node, described)
-        return found
+        return self._nodes.parts()
 
     async def ready(self) -> None:
         """Wait until all subscriptions so far have reached the broker.
@@ -310,7 +265,7 @@ class SkinClient:
             return bool(made) and all(link.has(want) for link in made)
 
         await self._until(is_ready)
-        self._refuse_unread(self._node_topics().union(*map(self._required, self._streams)))
+        self._refuse_unread(lambda wanted: wanted.nodes.union(*map(wanted.required, self._streams)))
 
     async def info(self, timeout_s: float = 5.0) -> dict[str, NodeInfo]:
         """Return the descriptions of the robot's nodes: parts, taxels, places.
@@ -324,18 +279,10 @@ class SkinClient:
         _check_times(timeout_s=timeout_s)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
-                await self._until(
-                    lambda: (
-                        self.nodes
-                        # Infos come before the statuses, which show whose parts they are.
-                        and all(node.has_status for node in self.nodes.values())
-                        and all(node.info or not node.online for node in self.nodes.values())
-                        and any(node.info for node in self.nodes.values())
-                    )
-                )
+                await self._until(lambda: self._nodes.are_described)
         known = {name: node.info for name, node in self.nodes.items() if node.info is not None}
         if not known:
-            self._refuse_unread(self._node_topics())
+            self._refuse_unread(lambda subscriptions: subscriptions.nodes)
             raise BrokerError(
                 f'broker {self.where}: no node of robot "{self.robot}" published its info; '
                 "is `skin run` running?"
@@ -367,49 +314,35 @@ class SkinClient:
             RequestError: it is not clear which node is meant, or a name or a number cannot be sent.
             BrokerError: no node is online, or the broker does not let us receive answers.
         """
-        if not NAME.fullmatch(name) or not (node is None or NAME.fullmatch(node)):
-            raise RequestError(
-                "a command and a node have names of up to 64 of the characters a-z 0-9 _ -"
-            )
+        if node is not None:
+            refuse_wrong_name(node)
         if timeout_s is None:
-            timeout_s = ANSWER_S + _duration_s(arguments)
+            timeout_s = answer_within_s(arguments)
         _check_times(timeout_s=timeout_s)
-        number = f"{self._identifier}-{next(self._numbers)}"
-        try:
-            request = encode_request(arguments | {"id": number})
-        except ValueError:
-            raise RequestError(f"{name}: seen nan or inf, wanted numbers") from None
-        self._asked[number] = None
-        try:
-            async with asyncio.timeout(timeout_s):
-                node = node or await self._only_node()
-                self._refuse_deaf(node)
-                self._refuse_unread({self._replies})
-                await self._ask(node, name, request)
-                result = await self._until(partial(self._answer, node, number))
-        except TimeoutError:
-            if not self.connected:
-                raise CommandError(f"broker {self.where}: {self.last_error}") from None
-            raise CommandError(
-                f'no answer to "{name}" from node "{node or "?"}" of robot "{self.robot}" within '
-                f"{timeout_s:g} s; it may still be carried out; is `skin run` running there?"
-            ) from None
-        except MqttError as error:
-            raise CommandError(f"broker {self.where}: {explain(error)}") from None
-        finally:
-            del self._asked[number]
-        if not result.ok:
-            cause = result.cause or None
-            kind = WrongCommandError if cause == "request" else CommandError
-            raise kind(result.error or "refused without a reason", cause)
-        return result.result or {}
+        with self._requests.request(name, arguments) as request:
+            try:
+                async with asyncio.timeout(timeout_s):
+                    node = node or await self._only_node()
+                    self._refuse_deaf(node)
+                    self._refuse_unread(lambda subscriptions: {subscriptions.replies})
+                    await self._ask(node, name, request.payload)
+                    await self._until(partial(self._is_answered, request, node))
+            except TimeoutError:
+                if not self.connected:
+                    raise CommandError(f"broker {self.where}: {self.last_error}") from None
+                raise CommandError(
+                    f'no answer to "{name}" from node "{node or "?"}" of robot "{self.robot}" '
+                    f"within {timeout_s:g} s; it may still be carried out; "
+                    "is `skin run` running there?"
+                ) from None
+            except MqttError as error:
+                raise CommandError(f"broker {self.where}: {explain(error)}") from None
+        return request.result()
 
-    def _answer(self, node: str, number: str) -> Result | None:
-        """Return the answer to a request; None: it may still come."""
-        answer = self._asked[number]
-        if answer is None:
+    def _is_answered(self, request: Request, node: str) -> bool:
+        if request.answer is None:
             self._refuse_deaf(node)
-        return answer
+        return request.answer is not None
 
     def _refuse_deaf(self, node: str) -> None:
         """Refuse to wait for the answer of a node that receives no request."""
@@ -463,7 +396,7 @@ class SkinClient:
     @property
     def _is_asking(self) -> bool:
         """Return whether the broker is being asked which robot it knows."""
-        return self._topics is None and any(link.reached for link in self._links)
+        return self._subscriptions is None and any(link.reached for link in self._links)
 
     def _absence(self) -> BrokerError:
         link = next((link for link in self._links if not link.failure), self._links[0])
@@ -527,7 +460,7 @@ class SkinClient:
                 if part in (None, contact.part):
                     stream.put(contact)
         if "info" in kinds:
-            for described in self._described.values():
+            for described in self._nodes.described():
                 if part in (None, described.part):
                     stream.put(described)
         self._ask_again()
@@ -546,7 +479,7 @@ class SkinClient:
         if part is None or not all(link.connection for link in self._links):
             return None
         names = self._presence.named()
-        since_s = max(self._named_s, *(link.since_s for link in self._links))
+        since_s = max(self._nodes.named_s, *(link.since_s for link in self._links))
         if names is None or part in names or now_s - since_s < NAMED_S:
             return None
         return no_such_part(self.robot, part, names)
@@ -584,63 +517,38 @@ class SkinClient:
 
     async def _ask(self, node: str, name: str, request: bytes) -> None:
         connection = await self._until(lambda: self._way_to(node))
-        assert connection is not None and self._topics is not None
+        assert connection is not None and self._subscriptions is not None
+        topics = self._subscriptions.topics
         properties = message_properties(self._links[0].broker, JSON_TYPE)
         if properties is not None:
-            properties.ResponseTopic = self._topics.reply(node, self._identifier)
-        why = await connection.request(self._topics.command(node, name), request, properties)
+            properties.ResponseTopic = topics.reply(node, self._identifier)
+        why = await connection.request(topics.command(node, name), request, properties)
         if why:
             raise CommandError(
                 f"broker {self.where}: does not let us command ({why}); log in as one who may"
             )
 
-    def _topics_of(self, kind: PartTopic, part: str | None) -> set[str]:
-        """Return the topics by which a kind of message of a part, or of all, may come."""
-        if self._topics is None:
-            return set()
-        return {self._topics.part(kind, name) for name in ("+", part) if name is not None}
-
-    def _required(self, stream: Stream[Any]) -> set[str]:
-        """Return the topics without which a stream receives nothing that is true."""
-        kinds = {one for kind in stream.kinds for one in needed(kind)}
-        if "contact" in stream.kinds:
-            kinds.remove("touch")  # it is of use to `present` alone
-        nodes = self._node_topics() if "info" in stream.kinds else set()
-        return nodes.union(*(self._topics_of(kind, stream.part) for kind in kinds))
-
-    def _node_topics(self) -> set[str]:
-        """Return the topics of what the nodes are, and whether they are online."""
-        topics = self._topics
-        if topics is None:
-            return set()
-        return {topics.node("status", "+"), topics.node("info", "+"), topics.info("+", "+")}
-
-    @property
-    def _replies(self) -> str:
-        """The topic of the answers to our requests."""
-        if self._topics is None:
-            return ""
-        if self._links[0].broker.v5:
-            return self._topics.reply("+", self._identifier)
-        return self._topics.result("+", "+")
-
-    def _refuse_unread(self, topics: set[str]) -> None:
+    def _refuse_unread(self, needs: Callable[[Subscriptions], set[str]]) -> None:
         """Refuse what needs a topic that a broker does not let us subscribe to.
 
         Raises:
             BrokerError: there is one among these.
         """
+        if self._subscriptions is None:
+            return
         for link in self._links:
-            for topic in sorted(link.refused & topics):
+            for topic in sorted(link.refused & needs(self._subscriptions)):
                 raise refusal(link.broker, topic)
 
     def _note_refusals(self, link: BrokerLink) -> None:
         """Let streams raise that a broker refuses what they need."""
-        for stream in self._streams if link.refused else ():
-            for topic in self._required(stream) & link.refused:
+        if self._subscriptions is None or not link.refused:
+            return
+        for stream in self._streams:
+            for topic in self._subscriptions.required(stream) & link.refused:
                 stream.refuse(topic, refusal(link.broker, topic))
-        for part in self._names[False] if link.refused else ():
-            if link.refused & self._topics_of("contact", part):
+        for part in self._names[False]:
+            if link.refused & self._subscriptions.of("contact", part):
                 self._presence.take_refusal(part, link.number)
 
     def _way_to(self, node: str) -> Connection | None:
@@ -652,9 +560,9 @@ class SkinClient:
         return None
 
     async def prepare(self, connection: Connection, broker: Broker) -> None:
-        if self._topics is None:
+        if self._subscriptions is None:
             self._robot = await only_robot(connection, broker, self._base)
-            self._topics = Topics(self._base, self._robot)
+            self._subscriptions = self._subscriptions_of(self._robot)
 
     def note(self, link: BrokerLink) -> None:
         if link.last_error:
@@ -664,18 +572,18 @@ class SkinClient:
         self._note_refusals(link)
         if not self._stopping:
             self._report_contacts()
-            self._note_nodes()
+            self._nodes.watch(_now_s())
         self._news.set()
 
     def unfollow(self, topic: str) -> None:
         """Forget the states of parts that are not followed any more, neither by another topic."""
-        assert self._topics is not None
-        place = self._topics.parse(topic)
+        assert self._subscriptions is not None
+        place = self._subscriptions.topics.parse(topic)
         kind = None if place is None else place.kind
         if kind not in ("contact", "health", "touch"):
             return
         for part in self._names[False]:
-            if kind in self._kinds_of(part):
+            if kind in self._subscriptions.kinds_of(part):
                 continue
             if kind == "touch":
                 self._presence.forget_touches(part)
@@ -686,37 +594,12 @@ class SkinClient:
                 self._presence.forget_state(part)
             self._newest.forget(kind, part)
 
-    def _kinds_of(self, part: str) -> set[PartTopic]:
-        """Return the kinds of messages of a part that somebody reads."""
-        here = [stream for stream in self._streams if stream.part in (None, part)]
-        return {one for stream in here for kind in stream.kinds for one in needed(kind)}
-
-    def wanted(self) -> Iterator[str]:
-        """Yield the topics to subscribe to; none contains another, or messages would come twice.
-
-        Nodes come first: what is retained of a part whose node has stopped is out of date. Contact
-        states come before what shows that their part lives, or that would not be known of them.
-        """
-        topics = self._topics
-        if topics is None:
-            return
-        yield topics.node("status", "+")
-        yield topics.info("+")
-        yield topics.info("+", "+")
-        yield self._replies
-        asked: set[tuple[PartTopic, str | None]] = {
-            (kind, stream.part)
-            for stream in self._streams
-            for asked_kind in stream.kinds
-            for kind in needed(asked_kind)
-        }
-        for kind, part in sorted(asked, key=lambda one: one[0] != "contact"):
-            if part is None or (kind, None) not in asked:
-                yield topics.part(kind, "+" if part is None else part)
+    def wanted(self) -> Iterable[str]:
+        return () if self._subscriptions is None else self._subscriptions.wanted()
 
     def take(self, link: BrokerLink, message: Message) -> None:
-        assert self._topics is not None
-        place = self._topics.parse(message.topic.value)
+        assert self._subscriptions is not None
+        place = self._subscriptions.topics.parse(message.topic.value)
         payload = message.payload if isinstance(message.payload, bytes) else b""
         if place is None:
             return
@@ -728,9 +611,12 @@ class SkinClient:
                 self._take_status(name, payload, link, message)
             elif kind == "info":
                 if self._newness(kind, f"{name}/{piece}", message) is not False:
-                    self._take_info(name, piece, payload, stamp_of(message.properties))
+                    stamp = stamp_of(message.properties)
+                    self._nodes.take_info(name, piece, payload, stamp, _now_s())
+                    self._report_nodes()
             elif kind == "answer":
-                self._take_answer(decode_result(payload))
+                if self._requests.take(decode_result(payload)):
+                    self._news.set()
             else:
                 self._take_part(kind, name, payload, link, message)
         except SkinError as error:
@@ -777,63 +663,35 @@ class SkinClient:
         newness = self._newness("status", name, message)
         if newness is False:
             return
-        said = is_online(
+        online = is_online(
             payload, stamp_of(message.properties), is_only_broker=len(self._links) == 1
         )
-        parts = parts_of(message.properties)
-        now_s, again = _now_s(), newness is None
-        self._presence.take_node(name, said, now_s, link.number, again=again, parts=parts)
-        self._named_s = now_s
-        self.nodes.setdefault(name, Node()).has_status = bool(payload)
-        self._forget_if_deleted(name)
-        self._report_infos()
-        self._report_contacts()
-        self._note_nodes()
-        self._news.set()
+        self._nodes.take_status(
+            name,
+            online,
+            _now_s(),
+            link.number,
+            again=newness is None,
+            parts=parts_of(message.properties),
+            deleted=not payload,
+        )
+        self._nodes.watch(_now_s())
+        self._report_nodes()
 
-    def _forget_if_deleted(self, name: str) -> None:
-        """Forget a node of which nothing is retained any more: neither its status nor its info."""
-        if not self.nodes[name].pieces and not self.nodes[name].has_status:
-            del self.nodes[name]
-            self._presence.forget_node(name, _now_s())
-
-    def _note_nodes(self) -> None:
-        now_s = _now_s()
-        for name, node in self.nodes.items():
-            node.online = self._presence.online(name, now_s)
-
-    def _take_info(self, name: str, piece: int, payload: bytes, stamp: Stamp | None) -> None:
-        node = self.nodes.setdefault(name, Node())
-        self._info_bytes -= node.sizes.pop(piece, 0)
-        node.pieces.pop(piece, None)
-        if payload:
-            if self._info_bytes + len(payload) > MAX_INFO_BYTES:
-                raise MessageError(f"info: more than {MAX_INFO_BYTES} bytes of one robot")
-            node.pieces[piece] = decode_info(payload)
-            node.sizes[piece] = len(payload)
-            self._info_bytes += len(payload)
-        node.info = join_pieces(node.pieces)
-        if node.info is not None:
-            named = [*node.info.parts, *node.info.fingertips]
-            self._presence.take_info(name, named, _now_s(), stamp)
-            self._named_s = _now_s()
-        elif not node.pieces:
-            self._presence.forget_info(name, _now_s())
-            self._forget_if_deleted(name)
-        self._report_infos()
+    def _report_nodes(self) -> None:
+        """Pass on what a status or an info has changed."""
+        for described in self._nodes.changes():
+            for stream in self._streams:
+                if "info" in stream.kinds and stream.part in (None, described.part):
+                    stream.put(described)
         self._report_contacts()
         self._news.set()
-
-    def _take_answer(self, result: Result) -> None:
-        number = str(result.id)
-        if number in self._asked:
-            self._asked[number] = self._asked[number] or result
-            self._news.set()
 
     def _take_part(
         self, kind: PartTopic, part: str, payload: bytes, link: BrokerLink, message: Message
     ) -> None:
-        if kind not in self._kinds_of(part):
+        assert self._subscriptions is not None
+        if kind not in self._subscriptions.kinds_of(part):
             self._ask_again()  # nobody reads it any more
             return
         item = read(kind, part, payload, stored=message.retain)
@@ -910,21 +768,6 @@ class SkinClient:
                 if "contact" in stream.kinds and stream.part in (None, contact.part):
                     stream.put(contact)
 
-    def _report_infos(self) -> None:
-        now = self.parts()
-        gone = self._described.keys() - self._presence.holders.keys()
-        changed = [one for part, one in now.items() if self._described.get(part) != one]
-        for described in [*(Described(part, "", None) for part in gone), *changed]:
-            if described.info is None:
-                del self._described[described.part]
-            elif described.part in self._described or len(self._described) < MAX_NAMES:
-                self._described[described.part] = described
-            else:
-                continue
-            for stream in self._streams:
-                if "info" in stream.kinds and stream.part in (None, described.part):
-                    stream.put(described)
-
     async def _watch(self) -> None:
         """Detect timeouts."""
         while True:
@@ -932,7 +775,7 @@ class SkinClient:
             for event in self._order.expire(_now_s()):
                 self._pass_on(event, self._order.run_of(event))
             self._report_contacts()
-            self._note_nodes()
+            self._nodes.watch(_now_s())
             self._check_parts(_now_s())
 
 
@@ -954,13 +797,6 @@ def _check_times(**times_s: float) -> None:
     for name, time_s in times_s.items():
         if not time_s >= 0:
             raise RequestError(f"{name}: seen {time_s}, wanted seconds from 0 on")
-
-
-def _duration_s(arguments: Mapping[str, Any]) -> float:
-    """Return how long a command lasts, as far as its arguments show it."""
-    seconds = arguments.get("seconds")
-    lasts = isinstance(seconds, int | float) and 0 < seconds < math.inf
-    return float(seconds) if lasts else 0.0  # type: ignore[arg-type]
 
 
 def _sent_s(message: Message) -> float | None:

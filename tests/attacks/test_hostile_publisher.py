@@ -12,8 +12,8 @@ from skin_host.cli import main
 from skin_host.cli.lines import event_line, missed_line
 from skin_host.cli.watch import status_table
 from skin_host.client import Contact
+from skin_host.client.nodes import MAX_NAMES
 from skin_host.client.presence import MAX_TOUCHES, Presence
-from skin_host.client.session import MAX_NAMES
 from skin_host.mqtt.info import encode_info
 from skin_host.mqtt.messages import decode_health
 from skin_host.mqtt.payload import MessageError
@@ -74,7 +74,7 @@ async def test_more_parts_and_nodes_than_a_robot_has_are_passed_over(mosquitto: 
 async def test_infos_in_endless_pieces_are_passed_over(
     mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("skin_host.client.session.MAX_INFO_BYTES", 100_000)
+    monkeypatch.setattr("skin_host.client.nodes.MAX_INFO_BYTES", 100_000)
     async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
         publisher.put_info(INFO)
         await until(lambda: "main" in skin.nodes and skin.nodes["main"].info is not None)

@@ -18,8 +18,9 @@ from msgspec.structs import replace
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
-from skin_host.client import CommandError, Contact, SkinCallbacks, SkinClient, session
-from skin_host.client.session import ANSWER_S, LEAST_STALE_S
+from skin_host.client import CommandError, Contact, SkinCallbacks, SkinClient
+from skin_host.client.requests import ANSWER_S, answer_within_s
+from skin_host.client.session import LEAST_STALE_S
 from skin_host.config.settings import Mqtt, changed, load
 from skin_host.errors import BrokerError, RequestError, SkinError, StateError
 from skin_host.layout import build_layout
@@ -493,7 +494,7 @@ async def test_a_command_whose_answer_cannot_come_names_the_broker_that_is_gone(
 ) -> None:
     async with publishing(mosquitto), hearing(mosquitto) as skin:
         asked = asyncio.create_task(skin.command("sleep", node="main", timeout_s=1.0))
-        await until(lambda: skin._asked)
+        await until(lambda: skin._requests.waiting)
         mosquitto.kill()
         with pytest.raises(CommandError, match=f"broker 127.0.0.1:{mosquitto.port}: "):
             await asked
@@ -509,8 +510,8 @@ async def test_an_answer_that_comes_twice_or_is_of_another_request_harms_nobody(
             topic = f"skin/robot/nodes/main/replies/{skin._identifier}"
             head = {"schema": "skin.result/1", "command": "status", "ok": True}
             async with aiomqtt.Client(mosquitto.host, mosquitto.port) as stranger:
-                await until(lambda: skin._asked)
-                (number,) = skin._asked
+                await until(lambda: skin._requests.waiting)
+                (number,) = skin._requests.waiting
                 for other in ("", f"{number}0", 1, [], None):
                     await stranger.publish(topic, json.encode({**head, "id": other}), qos=1)
                 for result in ({"n": 1}, {"n": 2})[: 1 + twice]:
@@ -751,7 +752,7 @@ async def test_a_command_that_lasts_is_waited_for_that_long(
         async def __aexit__(self, *_: object) -> None:
             pass
 
-    assert session._duration_s({"seconds": seconds}) == lasts_s
+    assert answer_within_s({"seconds": seconds}) == ANSWER_S + lasts_s
     if isinstance(seconds, float) and not math.isfinite(seconds):
         return
     async with hearing(mosquitto) as skin:

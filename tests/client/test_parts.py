@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skin_host.client import Contact, Described, RequestError, SkinCallbacks, session
+from skin_host.client import Contact, Described, RequestError, SkinCallbacks
 from skin_host.client.presence import Presence
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
@@ -227,14 +227,14 @@ async def test_a_node_of_which_all_is_deleted_is_gone(mosquitto: Mosquitto) -> N
 async def test_of_more_parts_than_any_robot_has_no_description_is_passed_on(
     mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "MAX_NAMES", 3)
+    monkeypatch.setattr("skin_host.client.nodes.MAX_NAMES", 3)
     async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
         infos = skin.infos()
         for start in (0, 10):
             parts = {f"part{number}": HAND for number in range(start, start + 9)}
             publisher.put_info(replace(INFO, parts=parts))
             await until(lambda: f"part{start}" in skin.parts())  # noqa: B023
-        assert len(skin._described) == 3
+        assert len(list(skin._nodes.described())) == 3
         assert [one.info is None for one in await take(infos, 9)] == 3 * [False] + 3 * [
             True
         ] + 3 * [False]
