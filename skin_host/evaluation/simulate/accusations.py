@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from skin_host.evaluation.simulate.troubles import LONGEST_STALL_S, Trouble
+from skin_host.evaluation.simulate.troubles.computer import LONGEST_STALL_S
+from skin_host.evaluation.simulate.troubles.trouble import Trouble
 from skin_host.evaluation.simulate.world import World
 from skin_host.mqtt.connection import GRACE_S, LAST_RETRY_S, TIMEOUT_S
 

@@ -5,7 +5,7 @@ import msgspec
 from emulator.probes.scene import Fault
 from skin_host.evaluation.simulate.accusations import NOISE
 from skin_host.evaluation.simulate.deeds import Deeds
-from skin_host.evaluation.simulate.troubles import act
+from skin_host.evaluation.simulate.troubles.acts import act
 from skin_host.mqtt.commands import MAX_RUNNING
 
 #: How long it may take to be well, and after what time an operator calibrates again.

@@ -6,7 +6,9 @@ from pathlib import Path
 
 from skin_host.errors import ConfigurationError
 from skin_host.evaluation.simulate.promises import Promises
-from skin_host.evaluation.simulate.troubles import ACTS, APART, Trouble, act, kinds_of
+from skin_host.evaluation.simulate.troubles.acts import ACTS, act
+from skin_host.evaluation.simulate.troubles.catalogue import APART, kinds_of
+from skin_host.evaluation.simulate.troubles.trouble import Trouble
 from skin_host.evaluation.simulate.world import Life, World
 
 

@@ -9,7 +9,7 @@ from emulator.probes.scene import Fault
 from skin_host.evaluation.simulate.accusations import BACK_NS, QUIET_NS, STARTED_NS
 from skin_host.evaluation.simulate.deeds import Deeds
 from skin_host.evaluation.simulate.storm import PRESS_S, SHORT_S
-from skin_host.evaluation.simulate.troubles import act
+from skin_host.evaluation.simulate.troubles.acts import act
 
 #: A trouble lasts no longer alone.
 LONGEST_DRILL_S = 60.0

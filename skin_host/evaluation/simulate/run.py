@@ -24,7 +24,7 @@ from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.promises.limits import SAMPLE_S
 from skin_host.evaluation.simulate.storm import Storm
 from skin_host.evaluation.simulate.trace import Before
-from skin_host.evaluation.simulate.troubles import APART
+from skin_host.evaluation.simulate.troubles.catalogue import APART
 from skin_host.evaluation.simulate.world import World
 from skin_host.layout import Layout
 from skin_host.processes import Processes

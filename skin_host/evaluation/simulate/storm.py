@@ -5,7 +5,7 @@ import random
 from typing import Any
 
 from skin_host.evaluation.simulate.deeds import Deeds
-from skin_host.evaluation.simulate.troubles import WIRING
+from skin_host.evaluation.simulate.troubles.hardware import WIRING
 from skin_host.evaluation.simulate.world import Spot
 
 #: How long a storm lasts.

@@ -31,7 +31,9 @@ from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.run import _Run
 from skin_host.evaluation.simulate.storm import Storm
 from skin_host.evaluation.simulate.trace import Trace
-from skin_host.evaluation.simulate.troubles import KINDS, Trouble, act
+from skin_host.evaluation.simulate.troubles.acts import act
+from skin_host.evaluation.simulate.troubles.catalogue import KINDS
+from skin_host.evaluation.simulate.troubles.trouble import Trouble
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import PadKind

@@ -20,7 +20,8 @@ from skin_host.config.settings import changed
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.run import RunResult, simulate, simulate_all
-from skin_host.evaluation.simulate.troubles import act, kinds_of
+from skin_host.evaluation.simulate.troubles.acts import act
+from skin_host.evaluation.simulate.troubles.catalogue import kinds_of
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.fingertip.frozen import Frozen

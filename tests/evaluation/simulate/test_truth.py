@@ -17,7 +17,7 @@ from skin_host.config.settings import TouchSettings
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.promises.contacts import least_mean
 from skin_host.evaluation.simulate.run import simulate
-from skin_host.evaluation.simulate.troubles import APART, kinds_of
+from skin_host.evaluation.simulate.troubles.catalogue import APART, kinds_of
 from skin_host.fingertip.events import Over, Slip
 from skin_host.fingertip.tip import Tip
 from skin_host.processing import pipeline, touch

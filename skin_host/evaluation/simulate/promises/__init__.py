@@ -42,7 +42,8 @@ from skin_host.evaluation.simulate.promises.skin import SkinCheck
 from skin_host.evaluation.simulate.promises.subscribers import Subscribers
 from skin_host.evaluation.simulate.promises.truth import Truth
 from skin_host.evaluation.simulate.promises.zeros import ZeroCheck
-from skin_host.evaluation.simulate.troubles import Trouble, damaged_set_up
+from skin_host.evaluation.simulate.troubles.hardware import damaged_set_up
+from skin_host.evaluation.simulate.troubles.trouble import Trouble
 from skin_host.evaluation.simulate.world import Life, Triangle, World
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import PadKind

@@ -12,7 +12,7 @@ from skin_host.evaluation.simulate.promises.limits import (
     WAITED_NS,
     Mask,
 )
-from skin_host.evaluation.simulate.troubles import RECOVERS_S, Trouble
+from skin_host.evaluation.simulate.troubles.trouble import RECOVERS_S, Trouble
 from skin_host.evaluation.simulate.world import Triangle, World
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.evaluation.simulate.troubles import LONGEST_STALL_S
+from skin_host.evaluation.simulate.troubles.computer import LONGEST_STALL_S
 
 NS = 1_000_000_000
 LONG_AGO_NS = -(1 << 62)
