@@ -418,6 +418,8 @@ def read_channels(
             damage = block.damage
             if damage is not None:
                 break
+    if rest is not None and len(rest):
+        yield from _by_channel(rest, rest_channel, names)
     if n and isinstance(damage, UnfinishedError):
         shown = visible(str(path))
         log.warning("%s: ends in the middle of a line; read as far as it is whole", shown)
@@ -429,8 +431,6 @@ def read_channels(
         raise LogError(f"{path}: {where}: {one_line(damage)}") from None
     if not n:
         raise LogError(f"{path}: it contains no CAN frame; wanted a recording, e.g. of candump")
-    if rest is not None and len(rest):
-        yield from _by_channel(rest, rest_channel, names)
 
 
 def _windows(
@@ -505,8 +505,8 @@ def _frame(message: "can.Message") -> tuple[str, Frame] | None:
 
 def _blocks(path: Path) -> Generator[Block, None, None]:
     """The frames of a recording in order; what is damaged ends them."""
+    check_format(path)
     suffixes = [suffix.lower() for suffix in path.suffixes]
-    _check(path, suffixes)
     if suffixes[-1:] == [".log"]:
         with path.open("rb") as file:
             yield from read_blocks(file, _frame)
@@ -535,6 +535,24 @@ class _Lines(io.TextIOWrapper):
         return line
 
 
+class _TrcLines(_Lines):
+    """Those of one recording: its times count from the begin that its head states, and python-can
+    would count those of another that follows it from there, too.
+    """
+
+    _has_begun = False
+
+    def __next__(self) -> str:  # type: ignore[override]
+        line = super().__next__()
+        if not line.startswith(";"):
+            self._has_begun = self._has_begun or not line.isspace()
+        elif self._has_begun and line.startswith(";$"):
+            raise ValueError(
+                "it goes on after its end, as two recordings one after the other; wanted one"
+            )
+        return line
+
+
 def _reader(path: Path) -> "can.io.generic.MessageReader":
     """python-can's reader, which would read a line of any length and a container of any size."""
     import gzip
@@ -554,7 +572,8 @@ def _reader(path: Path) -> "can.io.generic.MessageReader":
     if not issubclass(kind, can.io.generic.TextIOMessageReader):
         return can.LogReader(path)
     file = gzip.open(path) if zipped else path.open("rb")  # noqa: SIM115  # the reader closes it
-    lines = _Lines(cast(BinaryIO, file), encoding="utf-8-sig", errors="strict")
+    kind_of_lines = _TrcLines if kind is can.TRCReader else _Lines
+    lines = kind_of_lines(cast(BinaryIO, file), encoding="utf-8-sig", errors="strict")
     return DatedAscReader(lines) if kind is can.ASCReader else kind(lines)
 
 
@@ -591,13 +610,13 @@ def _messages(path: Path) -> Iterator[Block]:
     yield block_of(frames, names, n, damage)
 
 
-def _check(path: Path, suffixes: list[str]) -> None:
-    """Whether there is a file of a known format.
+def check_format(path: Path) -> None:
+    """Check that there is a file of a known format.
 
     Raises:
         LogError: there is none.
     """
-    seen = _format(suffixes)
+    seen = _format([suffix.lower() for suffix in path.suffixes])
     if seen != ".log":
         import can.io.player
 

@@ -15,7 +15,8 @@ import re
 import select
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from skin_host import __version__, emulator_path
 from skin_host.cli import (
@@ -29,7 +30,7 @@ from skin_host.cli import (
     watch,
     without_robot,
 )
-from skin_host.cli.common import ended_in_good_order
+from skin_host.cli.common import ended_in_good_order, filled
 from skin_host.daemon import service
 from skin_host.errors import SkinError, nearest, visible
 
@@ -41,6 +42,10 @@ MANY = 8
 
 
 class _Parser(argparse.ArgumentParser):
+    def __init__(self, *words: Any, **options: Any) -> None:
+        super().__init__(*words, **options)
+        self.register("type", Path, lambda text: Path(filled(text)))  # Path("") is this folder
+
     def error(self, message: str) -> NoReturn:
         """Print one line instead of the usage text; for a mistyped word it suggests the probable
         one.

@@ -160,7 +160,7 @@ def play(arguments: argparse.Namespace) -> int:
     if arguments.onto == "can":
         return asyncio.run(_play_on_buses(arguments))
     if arguments.config is None and not is_mcap(arguments.log):
-        raise RequestError(f"{arguments.log}: CAN frames need --config to be processed")
+        raise _needs_config(arguments.log)
     if arguments.config is not None:
         return asyncio.run(_play_processed(arguments))
     return asyncio.run(_play_said(arguments))
@@ -201,6 +201,18 @@ def _calibration(
     for doubt in doubts(found, settings, layout):
         warn_of(doubt)
     return found
+
+
+def _needs_config(recording: Path) -> RequestError:
+    """Return the error of a recording of CAN frames without --config.
+
+    Raises:
+        LogError: there is no such recording.
+    """
+    from skin_host.bus.logs import check_format
+
+    check_format(recording)
+    return RequestError(f"{recording}: CAN frames need --config to be processed")
 
 
 def _numbers(text: str) -> list[int]:
@@ -311,7 +323,7 @@ def _series(arguments: argparse.Namespace) -> "Series":
 
     if arguments.config is None:
         if not is_mcap(arguments.recording):
-            raise RequestError(f"{arguments.recording}: CAN frames need --config to be processed")
+            raise _needs_config(arguments.recording)
         return read_messages(arguments.recording)
     settings, layout = load_skin(arguments.config)
     found = _calibration(arguments, arguments.recording, settings, layout)

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import threading
 from collections.abc import Callable, Coroutine, Sequence
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from functools import partial
 from typing import Any, Literal, Self, TypeVar
 
@@ -66,6 +66,9 @@ class SkinCallbacks:
         )
         self._ready: Future[tuple[SkinClient, asyncio.AbstractEventLoop]] = Future()
         self._end = asyncio.Event()
+        #: Held while something is given to the thread, which takes nothing more once it is over.
+        self._giving = threading.Lock()
+        self._is_over = False
         self._calls: set[asyncio.Task[None]] = set()
         #: By stream: that the robot has no part of its name, or the broker refuses its topic.
         self._failures: dict[Stream[Any], SkinError] = {}
@@ -160,6 +163,11 @@ class SkinCallbacks:
             if self._ready.done():
                 raise
             self._ready.set_exception(error)
+        finally:
+            with self._giving:
+                self._is_over = True
+            # What was given before becomes a task, which is cancelled: nobody waits for ever.
+            await asyncio.sleep(0.0)
 
     def _on(
         self, open_stream: Callable[[SkinClient], Stream[T]], call: Callable[[T], object]
@@ -200,10 +208,14 @@ class SkinCallbacks:
     def _wait_for(self, work: Callable[[SkinClient], Coroutine[Any, Any, T]]) -> T:
         if threading.current_thread() is self._thread:
             raise RequestError("a callback cannot wait for messages; ask in another thread")
-        if not self._thread.is_alive():
-            raise RequestError(
-                "these callbacks were not entered: use them in their `with` block"
-                if self._thread.ident is None
-                else "these callbacks have ended: nothing is received any more"
-            )
-        return asyncio.run_coroutine_threadsafe(work(self._skin), self._loop).result()
+        if self._thread.ident is None:
+            raise RequestError("these callbacks were not entered: use them in their `with` block")
+        ended = RequestError("these callbacks have ended: nothing is received any more")
+        with self._giving:
+            if self._is_over:
+                raise ended
+            asked = asyncio.run_coroutine_threadsafe(work(self._skin), self._loop)
+        try:
+            return asked.result()
+        except CancelledError:
+            raise ended from None

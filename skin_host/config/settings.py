@@ -6,6 +6,7 @@ Unknown keys, wrong types, wrong lengths and references to nothing are errors th
 name the file and the path inside it. `docs/configuration.md` explains every key.
 """
 
+import codecs
 import hashlib
 import os
 from collections.abc import Callable, Mapping
@@ -342,8 +343,11 @@ def read_toml(path: Path, table: type[T], named: Named) -> T:
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
     try:
-        document = msgspec.toml.decode(data)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        # Editors of other systems begin a text with a mark of its coding.
+        document = msgspec.toml.decode(data.removeprefix(codecs.BOM_UTF8))
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{path}: not TOML: {error}; save it as UTF-8") from None
+    except msgspec.DecodeError as error:
         raise ConfigurationError(f"{path}: not TOML: {visible(str(error))}") from None
     except ValueError:  # Python reads no number of more than 4300 digits
         raise ConfigurationError(

@@ -378,9 +378,18 @@ def candump_lines(channel: str, batch: FrameBatch) -> bytes:
     return "".join(lines).encode()
 
 
-def _check_room(folder: Path, names: str) -> None:
+def _make_room(folder: Path, names: str) -> None:
+    """Make a folder for one more recording.
+
+    Raises:
+        StateError: the folder holds as many as it may, or its disk is full but for the reserve.
+        OSError: it cannot be made.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
     if sum(1 for _ in folder.glob(names)) >= MAX_RECORDINGS:
         raise StateError(f"{folder}: holds {MAX_RECORDINGS} recordings already; move some away")
+    if (full := _full(folder, LEAST_BYTES)) is not None:
+        raise StateError(f"{folder}: {full}; move recordings away")
 
 
 def _full(file: Path | int, more: int = 0) -> str | None:
@@ -421,10 +430,7 @@ class FrameRecorder:
         self._over: str | None = None
         self._queue: queue.Queue[tuple[str, FrameBatch] | None] = queue.Queue(WAITING_BATCHES)
         with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            _check_room(path.parent, "*")
-            if (full := _full(path.parent, LEAST_BYTES)) is not None:
-                raise StateError(f"{path.parent}: {full}; move recordings away")
+            _make_room(path.parent, "*")
             try:
                 file = path.open("xb", buffering=0)
             except FileExistsError:
@@ -554,12 +560,13 @@ class PageRecording:
 
         Raises:
             RequestError: one is in progress.
-            StateError: the folder is full.
+            StateError: the folder is full, or its disk but for the reserve.
             SkinError: mcap is not installed, or the file cannot be made.
         """
         if self._recorder is not None:
             raise RequestError(f"{self._path.name} is being recorded already; stop it")
-        _check_room(self._folder, f"*{MCAP_SUFFIX}")
+        with writing(self._folder):
+            _make_room(self._folder, f"*{MCAP_SUFFIX}")
         self._path = self._folder / self._clock.today().strftime(f"%Y%m%dT%H%M%SZ{MCAP_SUFFIX}")
         if os.path.lexists(self._path):
             raise RequestError(f"{self._path.name}: is there already; try again")
@@ -608,7 +615,7 @@ class PageRecording:
         }
 
     async def _run(self, capture: Awaitable[int]) -> None:
-        """Record until stopped, too long or too large, or the disk fails."""
+        """Record until stopped, too long or too large, or the disk fails or is full."""
         recorder = self._recorder
         assert recorder is not None
         working = asyncio.ensure_future(capture)
@@ -620,6 +627,9 @@ class PageRecording:
                     )
                 elif recorder.size_bytes > PAGE_MAX_BYTES:
                     self._ended = f"{self._path.name} has ended: it reached {PAGE_MAX_BYTES} bytes"
+                with writing(self._path):
+                    if (full := _full(self._folder)) is not None:
+                        self._ended = f"{self._path.name} has ended: {full}"
                 if self._ended is not None:
                     self._stop.set()
                 await asyncio.wait([working], timeout=WATCH_S)

@@ -174,6 +174,24 @@ def test_times_of_asc_that_count_from_the_line_before_are_refused(tmp_path):
         asc(tmp_path / "a.asc", "Tue Nov 14 22:13:20.042 2023", "hex  timestamps relative")
 
 
+def test_a_trc_after_another_does_not_get_its_times(tmp_path):
+    """Its times count from its own begin, which python-can reads from the first head alone."""
+    data = b""
+    for began_s in (1_700_000_000.0, 1_700_003_600.0):
+        with can.Logger(tmp_path / "one.trc") as writer:
+            for k in range(3):
+                writer(can.Message(timestamp=began_s + k, arbitration_id=4, data=[k]))
+        data += (tmp_path / "one.trc").read_bytes()
+    (tmp_path / "both.trc").write_bytes(data)
+    times_ns: list[int] = []
+    with pytest.raises(
+        LogError, match="after frame 3: it goes on after its end, as two recordings"
+    ):
+        for batch in read(tmp_path / "both.trc"):
+            times_ns += batch.t_ns.tolist()
+    assert times_ns == [1_700_000_000_000_000_000 + k * 1000 * MS for k in range(3)]
+
+
 @pytest.mark.skipif(not GRASP.exists(), reason=f"the recording {GRASP.name} is not here")
 def test_a_real_hands_recording_is_read_whole():
     batches = list(read(GRASP))
@@ -232,7 +250,7 @@ def test_what_comes_before_damage_is_handed_on(tmp_path):
     with pytest.raises(LogError, match="damaged after frame 3"):
         for batch in read(path):
             frames += len(batch)
-    assert frames == 2  # the third waited for the end of its window
+    assert frames == 3
 
 
 def test_frames_of_can_fd_are_passed_over(tmp_path):

@@ -41,12 +41,19 @@ def test_a_scan_that_nobody_answers_has_failed(
         ["view", "--name"],
         ["record", "a.mcap", "--robot"],
         ["replay", "a.mcap", "--onto", "broker", "--robot"],
+        # Tables would be scattered over the working directory.
+        ["export", "a.mcap", "OUTPUT"],
+        ["check", "CONFIG"],
+        ["report", "--output"],
+        ["replay", "a.log", "--config"],
+        ["replay", "LOG"],
+        ["view", "--recordings"],
     ],
 )
 def test_an_empty_name_is_refused(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     """It is that of a variable of the shell that is not set."""
     with pytest.raises(SystemExit) as end:
-        main([*command, ""])
+        main([*command, ""] if command[-1].startswith("--") else [*command[:-1], ""])
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"argument {command[-1]}: seen '', wanted a name" in line

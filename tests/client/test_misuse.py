@@ -1,6 +1,7 @@
 """What a program asks for wrongly is refused to it alone, in a line that names the reason."""
 
 import asyncio
+import threading
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -19,6 +20,7 @@ from skin_host.client import (
 )
 from tests.client.test_client import hearing, publishing, take, touch
 from tests.support.broker import Mosquitto
+from tests.support.waiting import PATIENCE_S
 
 #: They would be filters of other topics, no topics at all, or topics that no part has.
 IMPOSSIBLE = ("palm#", "#", "+", "arm/palm", "", "palm\n", "\udc80", "x" * 65)
@@ -127,6 +129,30 @@ def test_callbacks_are_used_while_they_are_entered(mosquitto: Mosquitto) -> None
     assert refusals() == {"these callbacks have ended: nothing is received any more"}
     with pytest.raises(RequestError, match="entered before: make other ones"):
         skin.__enter__()
+
+
+def test_who_asks_while_callbacks_end_is_refused_and_does_not_wait_for_ever(
+    mosquitto: Mosquitto,
+) -> None:
+    for _ in range(3):
+        refused: list[str] = []
+        skin = SkinCallbacks(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="robot")
+
+        def ask(use: Callable[[], Any], refused: list[str] = refused) -> None:
+            with pytest.raises(RequestError) as error:
+                while True:
+                    use()
+            refused.append(str(error.value))
+
+        uses = (skin.present, skin.parts, partial(skin.on_touch, print))
+        with skin:
+            threads = [threading.Thread(target=ask, args=(use,), daemon=True) for use in uses]
+            for thread in threads:
+                thread.start()
+            skin.ready()
+        for thread in threads:
+            thread.join(PATIENCE_S)
+        assert refused == ["these callbacks have ended: nothing is received any more"] * len(uses)
 
 
 def test_all_that_the_client_raises_can_be_caught_by_what_it_exports() -> None:

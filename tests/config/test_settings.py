@@ -438,8 +438,16 @@ def test_what_is_not_toml_is_named_with_its_line(tmp_path: Path) -> None:
 def test_bytes_that_are_not_text_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_bytes(b"\xff\xfe\x00robot")
-    with pytest.raises(ConfigurationError, match="not TOML"):
+    with pytest.raises(ConfigurationError, match=r"not TOML: .*; save it as UTF-8"):
         load(path)
+
+
+def test_a_mark_of_the_coding_is_no_mistake(tmp_path: Path) -> None:
+    """Editors of other systems begin a text in UTF-8 with it."""
+    path = edited(tmp_path, "", "")
+    plain = load(path)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert load(path) == plain
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

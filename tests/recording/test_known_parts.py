@@ -156,3 +156,17 @@ def test_lines_are_not_broken_where_frames_are_seldom(tmp_path: Path) -> None:
     series = read_messages(tmp_path / "a.mcap")
     _, kpa = plots._broken(series, series.parts[PART], [3])
     assert kpa.tolist() == [[5.0]] * 4
+
+
+def test_contact_states_alone_are_known_from_one_to_the_next(tmp_path: Path) -> None:
+    """As `mcap filter` leaves them: they are published every 2 to 3 s, and it takes a moment."""
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for at_s in (0.0, 3.1, 6.2, 9.4, 18.0):
+            state = b"OFF" if at_s == 6.2 else b"ON"
+            recorder.say(f"{TOPIC}/contact", START_NS + round(at_s * S), state)
+            recorder.say("skin/icub/other/contact", START_NS + round((at_s + 1.0) * S), b"OFF")
+    found = read_messages(tmp_path / "a.mcap")
+    seen = [(one.state, (one.t_ns - START_NS) / S) for one in found.contacts if one.part == PART]
+    assert seen[:3] == [("ON", 0.0), ("OFF", 6.2), ("ON", 9.4)]
+    # Nothing of any part shows the time before.
+    assert seen[3:] == [("UNKNOWN", 18.0), ("ON", 18.0)]

@@ -102,14 +102,18 @@ def test_a_recording_opens_with_the_mcap_reader_and_replays_to_the_same_bytes(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["export", "a.log", "a.npz"], "skin export: a.log: CAN frames need --config"),
+        (["export", "b.log", "a.npz"], "skin export: b.log: CAN frames need --config"),
+        (["export", "a.log", "a.npz"], "skin export: a.log: cannot be read: No such file"),
+        (["export", ".", "a.npz"], "skin export: .: unknown format of file name; known are .asc"),
+        (["plot", "map", "setup.cfg", "a.png"], "skin plot: setup.cfg: unknown format of file"),
         (["export", "gone.mcap", "a.npz"], "skin export: gone.mcap: cannot be read: No such file"),
         (["plot", "calibration", "a.json", "a.png"], "skin plot: a calibration is drawn with"),
         (["record", "a.log"], "skin record: a.log: holds CAN frames alone and needs --config"),
         (["record", "setup.cfg"], "skin record: setup.cfg: is there already"),
         (["replay", "a.log"], "skin replay: the following arguments are required: --config"),
         (["replay", "a.log", "--onto", "can"], "skin replay: --onto can needs --config"),
-        (["replay", "a.log", "--onto", "broker"], "skin replay: a.log: CAN frames need --config"),
+        (["replay", "b.log", "--onto", "broker"], "skin replay: b.log: CAN frames need --config"),
+        (["replay", "a.log", "--onto", "broker"], "skin replay: a.log: cannot be read: No such"),
         (["dbc", "gone.toml"], "skin dbc: gone.toml: cannot be read"),
     ],
 )
@@ -121,13 +125,14 @@ def test_a_wrong_request_is_told_in_one_line(
     said: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("setup.cfg").touch()
+    for there in ("b.log", "setup.cfg"):
+        Path(there).touch()
     assert main(arguments) == 2
     seen = capsys.readouterr()
     assert seen.err.startswith(said)
     assert seen.err.count("\n") == 1
     assert seen.out == ""
-    assert [path.name for path in tmp_path.iterdir()] == ["setup.cfg"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.log", "setup.cfg"]
 
 
 def test_a_dbc_is_printed_or_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

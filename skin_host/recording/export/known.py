@@ -13,6 +13,9 @@ from skin_host.processing.events import Touch
 
 #: It is looked this often whether a part is still known while others are received.
 LOOK_NS = 500_000_000
+#: A recording without frames and health, as one that was filtered to contact states, shows nothing
+#: of a part but these, which are published every 2 to 3 s.
+CONTACT_STALE_S = 2 * STALE_S
 
 
 class ContactLine(NamedTuple):
@@ -36,12 +39,15 @@ class Known:
     Attributes:
         contacts: contact states as they change, UNKNOWN while nothing is known.
         gone: when parts ceased to be known, in the time of their own messages.
+
+    Args:
+        stale_s: a part of which nothing was recorded for this long is not known.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stale_s: float) -> None:
         self.contacts: list[ContactLine] = []
         self.gone: list[Gone] = []
-        self._presence = Presence(STALE_S)
+        self._presence = Presence(stale_s)
         self._states: dict[str, ContactState] = {}
         self._parts: dict[str, bool] = {}
         #: By part: the time in its last message that has one, and when that was recorded.

@@ -1,14 +1,16 @@
 """What was recorded, as arrays over time: read from messages, or computed from CAN frames."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from operator import methodcaller
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.client.presence import STALE_S
 from skin_host.client.streams import SentTwice
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import LogError, RequestError
@@ -31,7 +33,7 @@ from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.export.columns import TABLES
-from skin_host.recording.export.known import ContactLine, Gone, Known
+from skin_host.recording.export.known import CONTACT_STALE_S, ContactLine, Gone, Known
 from skin_host.recording.mcap import read_messages_of, robot_at
 from skin_host.recording.replay import contacts_of, replay
 
@@ -168,7 +170,8 @@ def read_messages(recording: Path) -> Series:
     found = Series({}, [], {})
     repeats = SentTwice()
     health: dict[str, HealthLine] = {}
-    known = Known()
+    #: What a client would have received, in its order.
+    received: list[Callable[[Known], None]] = []
     for said in read_messages_of(recording):
         words = said.topic.split("/")
         name, kind = words[-2:]
@@ -188,19 +191,20 @@ def read_messages(recording: Path) -> Series:
                         f"{len(frame.valid)} taxels; export the recordings of one skin"
                     )
                 growing.add(frame)
-                known.sign(name, said.t_ns, frame.t_ns)
+                received.append(methodcaller("sign", name, said.t_ns, frame.t_ns))
             elif kind in EVENT_DECODERS:
                 event = EVENT_DECODERS[kind](said.payload)
                 if not repeats.has(event):
                     found.take(event)
                     if isinstance(event, Touch):
-                        known.touch(event, said.t_ns)
+                        received.append(methodcaller("touch", event, said.t_ns))
             elif kind == "contact" and said.payload:
-                known.state(name, decode_contact(said.payload), said.t_ns)
+                state = decode_contact(said.payload)
+                received.append(methodcaller("state", name, state, said.t_ns))
             elif kind == "status":
-                known.status(name, said.payload, said.t_ns)
+                received.append(methodcaller("status", name, said.payload, said.t_ns))
             elif kind == "health" and said.payload:
-                known.sign(name, said.t_ns)
+                received.append(methodcaller("sign", name, said.t_ns))
                 line = health_line(name, said.t_ns, decode_health(said.payload))
                 if name not in health or health[name]._replace(t_ns=said.t_ns) != line:
                     health[name] = line
@@ -209,10 +213,14 @@ def read_messages(recording: Path) -> Series:
                 info = decode_info(said.payload)
                 found.shapes.update(info.parts)
                 found.fingertips.update(info.fingertips)
-                known.info(name, [*info.parts, *info.fingertips], said.t_ns)
+                names = [*info.parts, *info.fingertips]
+                received.append(methodcaller("info", name, names, said.t_ns))
         except MessageError as error:
             raise LogError(f"{recording}: {said.topic}: {error}") from None
     found.parts.update((name, part.series(name)) for name, part in parts.items())
+    known = Known(STALE_S if parts or health else CONTACT_STALE_S)
+    for take in received:
+        take(known)
     found.contacts.extend(known.contacts)
     found.gone.extend(known.gone)
     if not found.parts and not found.contents():

@@ -140,14 +140,14 @@ class Model {
     this.skin.material.color.set(look.body);
     this.edges.material.color.set(look.rim);
     for (const [mesh, colour] of [[this.rims, look.rim], [this.crosses, look.dim], [this.squares, look.dim], [this.rings, look.alarm]]) mesh.material.color.set(colour);
-    const stale = part.stale(nowMs);
+    const blank = part.isBlank(nowMs);
     let changed = false;
     for (let i = 0; i < part.n; i++) {
       const thermal = part.thermal[i] && !raw;
-      const known = !stale && !thermal && (raw ? part.raw !== null : part.valid(i));
-      const crossed = !stale && !thermal && !(known && (part.valid(i) || part.thermal[i]));
+      const known = !blank && !thermal && (raw ? part.raw !== null : part.valid(i));
+      const crossed = !blank && !thermal && !(known && (part.valid(i) || part.thermal[i]));
       const ringed = known && !raw && part.beyond(i);
-      const bits = known * 1 + (known || (stale && !thermal)) * 2 + crossed * 4 + thermal * 8 + ringed * 16;
+      const bits = known * 1 + (known || (blank && !thermal)) * 2 + crossed * 4 + thermal * 8 + ringed * 16;
       const state = bits + (part.thermal[i] && raw ? 32 : 0);
       if (this.states[i] !== state) { this.states[i] = state; changed = true; }
     }

@@ -92,27 +92,44 @@ export class History {
   }
 }
 
-/** One value over time, and whether it is a bound from below, such as a force: what does not change takes two points. */
+/** One value over time, and whether it is a bound from below, such as a force: what does not change takes two points. It is known for `knownMs` after it came, and null from then on. */
 export class Course {
-  constructor() { this.points = []; }
+  constructor(knownMs) {
+    this.points = [];
+    this.knownMs = knownMs;
+  }
 
   get last() { return this.points.at(-1)?.[0] ?? -Infinity; }
 
   add(nowMs, value, isLeast) {
     const points = this.points;
-    const same = (point) => point[1] === value && point[2] === isLeast;
-    // Two pictures of one moment are one.
-    if (nowMs - this.last < 5) points.pop();
+    points.push(...this.ended(nowMs));
+    // Two pictures of one moment are one; but the first may end a line, from where it steps.
+    if (nowMs - this.last < 5 && !this.isLevel(1)) points.pop();
+    const atMs = Math.max(nowMs, this.last + 0.01);
+    points.push([atMs, value, isLeast]);
+    if (this.isLevel(1) && this.isLevel(2)) points.splice(-2, 1);
     const n = points.length;
-    if (n > 1 && same(points[n - 1]) && same(points[n - 2]) && nowMs - points[n - 1][0] < GAP_MS) points[n - 1][0] = nowMs;
-    else points.push([nowMs, value, isLeast]);
     if (n > 1000 && points[n >> 1][0] < nowMs - LONGEST_S * 1000) this.points = points.slice(n >> 1);
   }
 
+  /** Whether the point that is `k` from the end continues the one before it. */
+  isLevel(k) {
+    const [before, point] = this.points.slice(-k - 1);
+    return this.points.length > k && before[1] === point[1] && before[2] === point[2];
+  }
+
+  /** The point at which the last value ceases to be known before a time, if it does. */
+  ended(nowMs) {
+    const isKnown = this.points.length > 0 && this.points.at(-1)[1] !== null;
+    return isKnown && nowMs - this.last > this.knownMs ? [[this.last + this.knownMs, null, true]] : [];
+  }
+
   between(fromMs, toMs) {
+    const points = [...this.points, ...this.ended(toMs)];
     // The point before the first goes along, so that a line comes in from the edge.
-    const first = this.points.findIndex(([t]) => t >= fromMs);
-    if (first < 0) return this.points.slice(-1);
-    return this.points.slice(Math.max(0, first - 1)).filter(([t]) => t <= toMs);
+    const first = points.findIndex(([t]) => t >= fromMs);
+    if (first < 0) return points.slice(-1);
+    return points.slice(Math.max(0, first - 1)).filter(([t]) => t <= toMs);
   }
 }

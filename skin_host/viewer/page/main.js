@@ -46,6 +46,7 @@ function connect() {
   socket.onclose = () => {
     link = "lost";
     dirty = true;
+    store.lose(performance.now());
     if (calibrating) say("The page lost its server: health shows whether the skin was calibrated.", 15000, "warn");
     calibrating = null;
     setTimeout(connect, 1000);
@@ -256,6 +257,7 @@ function signed(number) { return number < 0 ? `−${-number}` : `+${number}`; }
 
 function value(part, taxel) {
   if (part.stale(performance.now())) return "stale";
+  if (!part.hasFrames) return "no frames are published";
   if (map.raw) return part.raw ? `raw ${part.raw[taxel]} (${signed(part.raw[taxel] - part.noLoad[taxel])})` : "no raw value";
   if (part.thermal[taxel]) return "feels temperature";
   if (!part.valid(taxel)) return "not valid";
@@ -318,7 +320,7 @@ function showStatus(nowMs) {
 
 /** What is missing while raw values are shown. */
 function rawWords(nowMs) {
-  const without = map.raw ? map.parts.filter((part) => !part.raw && !part.stale(nowMs)) : [];
+  const without = map.raw ? map.parts.filter((part) => !part.raw && !part.isBlank(nowMs)) : [];
   const nodes = rawNodes();
   if (without.some((part) => nodes.includes(part.node))) return "Waiting for raw values";
   return without.length ? `No raw values are sent of ${named(without)}` : "";
@@ -336,7 +338,7 @@ function showScale(nowMs) {
   else {
     let peak = 0;
     for (const part of map.parts) {
-      if (part.stale(nowMs) || (map.raw && !part.raw)) continue;
+      if (part.isBlank(nowMs) || (map.raw && !part.raw)) continue;
       for (let i = 0; i < part.n; i++) {
         if (!part.valid(i)) continue;
         const value = map.raw ? part.noLoad[i] - part.raw[i] : part.pressure[i];

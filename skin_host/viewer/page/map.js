@@ -357,19 +357,19 @@ export class SkinMap {
     });
     ctx.setLineDash([]);
     ctx.globalAlpha = 1;
-    if (!solid) this.drawTaxels(ctx, look, part, pose, dx, dy, scale, stale);
+    if (!solid) this.drawTaxels(ctx, look, part, pose, dx, dy, scale, part.isBlank(nowMs));
     const [lx, ly] = this.toScreen(label);
     ctx.font = FONT;
     ctx.textAlign = "center";
     ctx.textBaseline = "bottom";
     ctx.fillStyle = stale ? look.alarm : look.dim;
     const age = part.heardMs === null ? "no data" : `stale, ${((nowMs - part.heardMs) / 1000).toFixed(0)} s`;
-    const words = stale ? `${part.name}: ${age}` : part.name;
+    const words = stale ? `${part.name}: ${age}` : part.hasFrames ? part.name : `${part.name}: touches only`;
     // What does not fit without touching the next label is told by its colour, and beside Health.
     ctx.fillText(ctx.measureText(words).width + 8 < room * scale ? words : part.name, lx, ly);
   }
 
-  drawTaxels(ctx, look, part, pose, dx, dy, scale, stale) {
+  drawTaxels(ctx, look, part, pose, dx, dy, scale, blank) {
     const colours = ramp();
     const buckets = new Map();
     const crosses = [];
@@ -386,7 +386,7 @@ export class SkinMap {
       if (x < -r || y < -r || x > w + r || y > h + r) continue;
       const behind = pose.towards[i] < 0;
       if (part.thermal[i] && !this.raw) { if (!behind && r > 3) squares.push(x, y, r); }
-      else if (stale) { if (!behind) rings.push(x, y, r, look.rim); }
+      else if (blank) { if (!behind) rings.push(x, y, r, look.rim); }
       else if (this.raw ? !part.raw : !part.valid(i)) { if (!behind) crosses.push(x, y, r); }
       else {
         const value = this.raw ? part.noLoad[i] - part.raw[i] : part.pressure[i];

@@ -210,8 +210,8 @@ function fill(article, part, once, nowMs) {
   put2(head.firstChild, part.name);
   put(head.lastChild, stateOf(part, nowMs));
   const taxels = `${part.valids(nowMs) ?? "?"} of ${part.health?.taxels ?? part.n} taxels valid`;
-  const frames = `${part.rate(nowMs).toFixed(1)} frames/s, ${part.missed} missed, ${taxels}`;
-  put(rates, part.fingertip ? `${told(stale ? null : part.health?.rate_hz, 0, "samples/s")} of force and torque` : frames);
+  const frames = part.hasFrames ? `${part.rate(nowMs).toFixed(1)} frames/s, ${part.missed} missed` : "no frames are published";
+  put(rates, part.fingertip ? `${told(stale ? null : part.health?.rate_hz, 0, "samples/s")} of force and torque` : `${frames}, ${taxels}`);
   const sentences = (part.health?.sentences ?? []).filter((says) => isOver(part, nowMs) || !once.has(says));
   const said = [...ages(part, nowMs, sentences.length ? "; before that:" : "."), ...sentences];
   keep(list, said.length, () => document.createElement("li")).forEach((item, k) => put(item, said[k]));
@@ -223,7 +223,7 @@ function ages(part, nowMs, end) {
   const since = (ms) => `for ${((nowMs - ms) / 1000).toFixed(0)} s${end}`;
   if (isOver(part, nowMs)) {
     const isLate = part.why === "stale" && nowMs - part.heardMs < 1000;
-    return [isLate ? "What comes is too late to be true." : `${part.fingertip ? "Nothing" : "No frame"} ${since(part.heardMs)}`];
+    return [isLate ? "What comes is too late to be true." : `${part.hasFrames ? "No frame" : "Nothing"} ${since(part.heardMs)}`];
   }
   return part.heardMs !== null && part.isHealthOld(nowMs) ? [`No health ${since(part.healthMs)}`] : [];
 }

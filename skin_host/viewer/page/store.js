@@ -6,6 +6,8 @@ const VALID = 1;
 const BEYOND = 2;
 /** Health comes once a second; what is older than this does not count as known. */
 const HEALTH_MS = 5000;
+/** A part without frames is alive as long as its health comes. */
+const HEALTH_PERIOD_MS = 1000;
 /** Why a contact state is not known, as the client of the broker gives it. */
 const WHY = {
   not_felt: "not all is felt",
@@ -25,7 +27,8 @@ export class Part {
     this.node = info.node;
     this.fingertip = Boolean(info.fingertip); // on a force/torque board: it has no taxels
     this.n = info.pads.length;
-    this.periodMs = info.period_ms;
+    this.hasFrames = !this.fingertip && info.frames !== false;
+    this.periodMs = this.hasFrames ? info.period_ms : HEALTH_PERIOD_MS;
     this.thermal = info.pads.map((pad) => pad === "thermal");
     this.position = info.position_m.map((p) => p.map((x) => x * 1e3));
     this.normal = info.normal;
@@ -42,7 +45,7 @@ export class Part {
     this.contacts = [];
     this.state = null; // whether anything touches it: ON, OFF, UNKNOWN; null: that has not come
     this.why = null; // why it is UNKNOWN
-    this.forces = new Course(); // of all contacts together
+    this.forces = new Course(this.limitMs); // of all contacts together
     this.forceOf = new Map(); // of each contact by its id
     this.noLoad = this.triangles.length ? Float32Array.from({ length: this.n }, (_, i) => this.triangleOf(i)?.no_load ?? 240) : new Float32Array(this.n);
     this.health = null;
@@ -77,7 +80,7 @@ export class Part {
   rememberForces(nowMs) {
     this.forces.add(nowMs, this.force(nowMs), this.isLeast(nowMs));
     for (const contact of this.contacts) {
-      if (!this.forceOf.has(contact.id)) this.forceOf.set(contact.id, new Course());
+      if (!this.forceOf.has(contact.id)) this.forceOf.set(contact.id, new Course(this.limitMs));
       this.forceOf.get(contact.id).add(nowMs, contact.force_n, isBound(contact));
     }
     for (const [id, course] of this.forceOf) if (course.last < nowMs - LONGEST_S * 1000) this.forceOf.delete(id);
@@ -90,10 +93,14 @@ export class Part {
   /** Whether its node has stopped, or all comes too late to be true. */
   get gone() { return this.why === "offline" || this.why === "stale"; }
 
-  /** Whether the data have stopped: longer than five periods, at least a second. */
-  stale(nowMs) {
-    return this.gone || this.heardMs === null || nowMs - this.heardMs > Math.max(1000, 5 * this.periodMs);
-  }
+  /** After so long without data they have stopped: five periods, at least a second. */
+  get limitMs() { return Math.max(1000, 5 * this.periodMs); }
+
+  /** Whether the data have stopped. */
+  stale(nowMs) { return this.gone || this.heardMs === null || nowMs - this.heardMs > this.limitMs; }
+
+  /** Whether nothing is known of its single taxels, and never is where no frames are published. */
+  isBlank(nowMs) { return !this.hasFrames || this.stale(nowMs); }
 
   take(view, nowMs) {
     const n = this.n;
@@ -174,6 +181,11 @@ export class Store {
     });
   }
 
+  /** Nothing comes from the server any more: what touches the skin is not known. */
+  lose(nowMs) {
+    for (const part of this.parts) part.takeContacts({ contacts: [], state: "UNKNOWN", why: "disconnected" }, nowMs);
+  }
+
   takeBytes(buffer, nowMs) {
     const view = new DataView(buffer);
     const part = this.parts[view.getUint16(2, true)];
@@ -186,7 +198,7 @@ export class Store {
     if (!part) return;
     part.health = message;
     part.healthMs = nowMs - 1000 * message.age_s;
-    if (part.fingertip) { part.hear(part.healthMs); part.rememberForces(nowMs); }
+    if (!part.hasFrames) { part.hear(part.healthMs); part.rememberForces(nowMs); }
     part.faults = new Set((message.triangles ?? []).map((t) => `${t.board}/${t.triangle}`));
   }
 }

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -340,6 +340,13 @@ async def test_nothing_touches_only_what_is_known_to_be_untouched(
         )
         await shows("Not known of palm, wrist, tip: the node is offline.", "not known")
         assert await seen.run(CONTACTS) == []
+        # The page loses its server: at once, though the last health of a fingertip is not old yet.
+        await seen.run("contacts('palm', 'OFF'); contacts('wrist', 'UNKNOWN', 'not_felt')")
+        await seen.run(f"contacts('tip', 'ON', null, [{one}])")
+        await shows(unknown, "≥ 1.50 N")
+        await seen.run("window.sockets.at(-1).onclose()")
+        await shows("Not known of palm, wrist, tip: there is no connection.", "not known")
+        assert await seen.run(CONTACTS) == []
 
 
 async def test_a_force_that_is_only_a_bound_is_shown_as_one(
@@ -388,6 +395,67 @@ async def test_a_force_that_is_only_a_bound_is_shown_as_one(
         bounds = ["1.50 N", "≥ 9.0 kPa", "20 mm²"]
         why = "a pad is pressed beyond its calibrated range"
         await shows("tip", bounds, why, beyond=True, verdict="contact")
+
+
+#: The course of a force from the times, values and bounds of what came, between two times.
+COURSE = """(async (came, fromMs, toMs) => {
+    const { Course } = await import("/history.js");
+    const course = new Course(1000);
+    for (const [atMs, value] of came) course.add(atMs, value, false);
+    return course.between(fromMs, toMs).map(([atMs, value]) => [Math.round(atMs), value]);
+})"""
+
+
+async def test_the_course_of_a_force_steps_and_ends_where_it_is_not_known(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """It was a slope: over a pause, and from the last change to a new value."""
+
+    async def course(came: Sequence[tuple[float, float | None]], to_ms: float) -> list[Any]:
+        return list(await seen.run(f"{COURSE}({json.dumps(came)}, 0, {to_ms})"))
+
+    async with viewing(mosquitto, "nobody", tmp_path / "p") as seen:
+        rest = [(float(at), 0.0) for at in range(0, 5001, 50)]
+        # A picture of a moment, and what touches then, come one after the other.
+        touch = [*rest, (5001.0, 2.0), (5050.0, 2.0)]
+        assert await course(touch, 5050) == [[0, 0], [5000, 0], [5001, 2], [5050, 2]]
+        assert await course([*rest, (5000.0, 2.0)], 5050) == [[0, 0], [5000, 0], [5000, 2]]
+        assert await course([(0.0, 1.0), (1.0, 2.0), (50.0, 3.0)], 50) == [[1, 2], [50, 3]]
+        # Nothing comes for two seconds; then for ever.
+        pause = [*rest, (7000.0, 2.0), (7050.0, 2.0)]
+        seconds = [[0, 0], [5000, 0], [6000, None], [7000, 2], [7050, 2]]
+        assert await course(pause, 8000) == seconds
+        assert await course(pause, 9000) == [*seconds, [8050, None]]
+        # What is not known stays so, however long that lasts.
+        assert await course([(0.0, None), (9000.0, 1.0)], 9000) == [[0, None], [9000, 1]]
+
+
+async def test_of_a_part_without_frames_contacts_are_shown(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """Its configuration has `frames = false`: it was shown as one of which nothing comes."""
+    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        silent = "part('palm', { frames: false })"
+        await seen.run(SERVER.replace("part('palm')", silent).replace('part("palm")', silent))
+        await seen.run(
+            "setInterval(() => { health('palm', 0); pressed(1, 0); health('tip', 0); }, 50)"
+        )
+        await seen.run("contacts('palm', 'OFF'); contacts('wrist', 'OFF'); contacts('tip', 'OFF')")
+        await seen.until(
+            f"{TOUCHING} === 'Nothing touches the skin.' && {TOTAL} === 'total: 0.00 N'"
+        )
+        one = "{ id: 4, taxels: [0], centroid_m: null, force_n: 1.5, peak_kpa: 9, area_mm2: 20 }"
+        await seen.run(f"contacts('palm', 'ON', null, [{one}])")
+        await seen.until(f"({CONTACTS})[0]?.[0] === 'palm' && {TOTAL} === 'total: 1.50 N'")
+        palm = """document.querySelector('#health article[data-part="palm"]')"""
+        assert await seen.run(f"{palm}.dataset.level") == "ok"
+        assert "no frames are published, 1 of 1 taxels valid" in await seen.run(f"{palm}.innerText")
+        await seen.until("window.labels.some(([text]) => text === 'palm: touches only')")
+        # Its health shows that it lives.
+        await seen.run("health = () => {}; window.health = () => {}")
+        gone = f"/^Not known of palm.*: nothing comes any more/.test({TOUCHING})"
+        await seen.until(f"{gone} && {TOTAL} === 'total: not known'")
 
 
 RAW = 'document.getElementById("show-raw").ariaPressed === "true"'
