@@ -89,6 +89,9 @@ HELD_SHARE = 0.5
 EASED_S = 60.0
 #: A zero that is uncertain by more than the paper's resolution (5 kPa) is reported.
 UNCERTAIN_UNITS = 2.0
+#: So is one, after this time, of a taxel that has been touched ever since it came into use: no
+#: reading has shown yet that it is right. After a night it may not be.
+UNSHOWN_S = 60.0
 #: For this long a baseline may return after a fall, and thermal evidence lasts.
 MEMORY_S = 3600.0
 #: Thermal evidence, in units^2 s, that weighs as much as the assumption of no relation.
@@ -139,8 +142,10 @@ class BaselineTracker:
 
     Attributes:
         calibrated: float64[n], the baselines before any drift.
-        common_units: how much of what the untouched taxels have in common was followed in the last
-            window.
+        shared_units: by how much, a number or [n], baselines moved in the last window with what the
+            untouched taxels have in common and temperature pads show.
+        owed_units: by how much, a number or [n], those of touched taxels are to rise with it when
+            they are released, as they have not yet.
         is_released: whether most of the taxels that were pressed of late are free, which shows that
             what pressed the part has gone.
     """
@@ -156,7 +161,8 @@ class BaselineTracker:
         n = len(baseline)
         self.baseline = baseline
         self.calibrated = baseline.copy()
-        self.common_units = 0.0
+        self.shared_units: Array | float = 0.0
+        self.owed_units: Array | float = 0.0
         self.is_released = False
         self._configure(usable, settings)
         self._thermal = _ThermalReference(triangle, thermal) if np.any(thermal) else None
@@ -189,6 +195,8 @@ class BaselineTracker:
         self._by_itself: Mask = np.zeros(n, np.bool_)
         #: For how long a taxel that was given back its baseline yet counts as loaded.
         self._loaded_s: Array = np.zeros(n)
+        #: Which taxels have been free since their zero came into use.
+        self._shown: Mask = np.zeros(n, np.bool_)
         self._touches = _Touches(n)
 
     def step(
@@ -215,11 +223,13 @@ class BaselineTracker:
             Numbers of taxels whose touch was recognised as drift, or None. Their baselines have
             moved up to their readings.
         """
+        self.shared_units = 0.0
         if self._settings.rule == "none" or dt_s <= 0.0:
             return None
         touched = touched & self._usable
         hidden = self._usable & (touched | missing)
         free = self._usable & ~hidden
+        self._shown |= free
         of_late = self._touches.touched_s > RECOVERED_S
         recovering = free & of_late
         pressed = np.count_nonzero(touched | (of_late & self._usable))
@@ -234,7 +244,7 @@ class BaselineTracker:
         shows = free & ~recovering
         share = _share(conversions)
         common = self._common(units, shows, received, np.where(shows | missing, share, 1.0), dt_s)
-        self.common_units = common
+        self.shared_units = common if forecast is None else common + forecast
         if self._is_calm(units, common, hidden, dt_s):
             change = self._own(units - common, self._settings.rate_units_per_s * dt_s, dt_s)
             self._move(change + common, common, forecast)
@@ -254,7 +264,7 @@ class BaselineTracker:
         self._last = level
         shown = bool(np.count_nonzero(free) >= REFERENCES)
         change += self._touches.step(units, touched, dt_s, relaxed_units, shown)
-        released = still & self._touches.released(units, touched, relaxed_units)
+        released = still & self._touches.released(units, touched, relaxed_units, self.owed_units)
         change[released] = units[released]
         ended = recovering & (self._free_s <= dt_s) & (self._taken_s <= 0.0)
         self._by_itself = (self._by_itself | ended) & ~released
@@ -285,6 +295,7 @@ class BaselineTracker:
         for memory in (self._fallen_s, self._former_s, self._taken_s, self._loaded_s, touched_s):
             memory[taxels] = 0.0
         self._apart[taxels] = 0.0
+        self._shown[taxels] = False
         if self._thermal is not None:
             self._thermal.forget(taxels)
 
@@ -311,10 +322,12 @@ class BaselineTracker:
 
     @property
     def frozen(self) -> Mask:
-        """Return taxels [n] whose zero is uncertain: touched for long, or with much drift
-        meanwhile.
+        """Return taxels [n] whose zero is uncertain: touched for long, ever since it came into use,
+        or with much drift meanwhile.
         """
-        long = self._touches.touched_s >= self._settings.frozen_report_s
+        longest_s = self._settings.frozen_report_s
+        limit_s = np.where(self._shown, longest_s, min(longest_s, UNSHOWN_S))
+        long = self._touches.touched_s >= limit_s
         return long | (self._touches.drifted > UNCERTAIN_UNITS)
 
     @property
@@ -324,6 +337,13 @@ class BaselineTracker:
         """
         edge = (self.baseline <= self._low) | (self.baseline >= self._high)
         return edge & self._usable
+
+    @property
+    def may_be_loaded(self) -> bool:
+        """Whether the untouched taxels rose faster than drift in the last window, so that something
+        may press on the whole part.
+        """
+        return self._loaded
 
     def _common(self, units: Array, free: Mask, received: int, share: Array, dt_s: float) -> float:
         """Return how much of the untouched taxels' common change is followed.
@@ -577,17 +597,24 @@ class _Touches:
         """Whether any touch is still remembered."""
         return self._fading_s > 0.0
 
-    def released(self, units: Array, touched: Mask, relaxed_units: Array | float) -> Mask:
+    def released(
+        self,
+        units: Array,
+        touched: Mask,
+        relaxed_units: Array | float,
+        owed_units: Array | float = 0.0,
+    ) -> Mask:
         """Return which touched taxels [n] read no more than a released contact and drift can
         leave.
 
         Args:
             units, touched: of the last step.
             relaxed_units: the relaxation [n].
+            owed_units: drift [n] that was shown, but not followed.
         """
         left = self._risen + MODEL_ERROR_SHARE * relaxed_units + SMOOTH_TOLERANCE_UNITS
         left = np.minimum(left + SLOW_UNITS_PER_S * self._hidden_s, UNSEEN_UNITS)
-        left = np.minimum(left, SLOW_UNITS_PER_S * self.touched_s)
+        left = np.minimum(left, SLOW_UNITS_PER_S * self.touched_s) + owed_units
         return touched & self._fallen(units) & (units < left)
 
     def _fallen(self, units: Array) -> Mask:

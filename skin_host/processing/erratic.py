@@ -73,7 +73,7 @@ class Erratic:
         #: At how many looks each pad was last not valid.
         self._missed = np.zeros(m, np.int8)
         self._step = step_kpa.astype(np.float32)
-        beside = next_of_chip(self._chip, self._known)
+        beside = quieter_of_chip(self._chip, self._known, self._step)
         self._scatter = Scatter(self._step, range_kpa.astype(np.float32), beside)
         self._score = np.zeros(m, np.float32)
         self._left_s = np.zeros(m)
@@ -194,8 +194,13 @@ class Erratic:
 
     def note_valid(self, pads: Mask) -> None:
         """Note once a second which pads [m] are valid, but for being erratic."""
-        self._missed += self._missed < LATELY_LOOKS
+        before = self._missed < LATELY_LOOKS
+        self._missed += before
         self._missed[pads] = 0
+        lately = self._missed < LATELY_LOOKS
+        if not np.array_equal(lately, before):
+            watched = self._known & lately
+            self._scatter.compare(quieter_of_chip(self._chip, watched, self._step))
 
     def pass_time(self, dt_s: float) -> None:
         """Let time pass, after which calm pads are no longer erratic."""
@@ -209,15 +214,19 @@ def most_of(pads: NDArray[np.intp]) -> NDArray[np.intp]:
     return np.maximum(pads // 2 + 1, LEAST_OF_CHIP)
 
 
-def next_of_chip(chip: NDArray[np.intp], watched: Mask) -> NDArray[np.intp]:
-    """Return for each pad [m] the next watched one of its chip, of the last the first; for one that
-    is not watched, or alone, itself.
+def quieter_of_chip(chip: NDArray[np.intp], watched: Mask, step_kpa: Floats) -> NDArray[np.intp]:
+    """Return for each pad [m] the watched one of its chip with the next smaller step; of the one
+    with the smallest the next larger; for one that is not watched, or alone, itself.
+
+    A quiet pad shows a broken contact long before one whose own noise hides it, and waits for none.
     """
     beside = np.arange(len(chip))
     order = np.flatnonzero(watched)
-    order = order[np.argsort(chip[order], kind="stable")]
-    for pads in np.split(order, np.flatnonzero(np.diff(chip[order])) + 1):
-        beside[pads] = np.roll(pads, -1)
+    order = order[np.lexsort((step_kpa[order], chip[order]))]
+    quieter, louder = order[:-1], order[1:]
+    alike = chip[quieter] == chip[louder]
+    beside[quieter[alike]] = louder[alike]
+    beside[louder[alike]] = quieter[alike]
     return beside
 
 

@@ -1,10 +1,12 @@
 """Taxels whose curve and memory are known from a recording under known pressure."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.processing.curves import Curve, Curves
-from skin_host.processing.drift import BaselineTracker
+from skin_host.processing.drift import SETTLE_S, BaselineTracker
 from skin_host.processing.erratic import Erratic, range_kpa, step_kpa
 from skin_host.processing.fitting.course import limit_kpa, make_memory
 from skin_host.processing.masks import Mask
@@ -66,6 +68,9 @@ class OwnCurves:
         #: Which were touched since the last fold.
         self._felt: Mask = np.zeros(m, np.bool_)
         self._touching = False
+        #: By how much the skin has drifted since each taxel was touched, as others show. A fall is
+        #: followed, and goes back; a rise above what the zero was is not, while the touch lasts.
+        self._shown_units: NDArray[np.float64] = np.zeros(m)
         #: Which were valid in the last sweep, but for the bytes that `without_rails` leaves out.
         self._present: Mask = np.ones(m, np.bool_)
         #: Of the samples since the last fold, the time since the one before each.
@@ -176,10 +181,12 @@ class OwnCurves:
 
         A load that grows slowly, or has nearly gone, reads like drift; on a skin with known curves
         it is more probable than drift. Where most of the part is released, it has gone: what a
-        pad reads then, within what foam and drift can leave, is taken for these at once.
+        pad reads then, within what foam and drift can leave, is taken for these at once. So is, in
+        any case, what the others have shown meanwhile.
 
         Args:
-            drift: with the baselines [m] that it would have, by its last step.
+            drift: with the baselines [m] that it would have, by its last step. It learns what is
+                owed to the touched ones.
             before: float64[m], the baselines of the window before.
             touched: bool[m], taxels whose baselines may not rise, but those of `drifted`.
             elapsed_s: how long the window was.
@@ -189,15 +196,28 @@ class OwnCurves:
             Those of `drifted` that are: the others stay touched while their baselines rise.
         """
         slow = RISE_UNITS_PER_S * elapsed_s
-        highest = before + np.where(touched, 0.0, slow)
+        shared = np.minimum(drift.shared_units, slow)
+        shown = self._shown_units + shared
+        if drift.may_be_loaded:
+            np.minimum(shown, np.maximum(self._shown_units, 0.0), out=shown)
+        fall = np.minimum(shown, 0.0) - np.minimum(self._shown_units, 0.0)
+        held = touched & self._own
         if drifted is not None:
-            # What the untouched ones show now is none of what was hidden.
-            shown = min(max(drift.common_units, 0.0), slow)
-            allowed = drift.baseline if drift.is_released else before + slow + shown
+            held[drifted] = False
+        drift.baseline += np.where(held, fall - shared, 0.0)
+        highest = before + np.where(touched, fall, slow)
+        self._shown_units = np.where(touched, shown, shown * math.exp(-elapsed_s / SETTLE_S))
+        owed = np.maximum(self._shown_units, 0.0) * self._own
+        if drifted is not None:
+            # What the untouched ones show is none of what was hidden.
+            allowed = drift.baseline if drift.is_released else before + slow + owed
             highest[drifted] = np.maximum(allowed, drift.calibrated)[drifted]
             reached = drift.baseline[drifted] <= highest[drifted]
             drifted = drifted[reached | ~self._own[drifted]]
         np.minimum(drift.baseline, highest, out=drift.baseline, where=self._own)
+        # What has been given is no longer owed.
+        self._shown_units -= np.clip(drift.baseline - before - slow, 0.0, owed)
+        drift.owed_units = np.maximum(self._shown_units, 0.0) * self._own
         return drifted if drifted is not None and len(drifted) else None
 
     def reset(self, taxels: Mask) -> None:
@@ -205,6 +225,7 @@ class OwnCurves:
         self._take_back()
         self._smoother.reset(taxels)
         self._reported = np.where(taxels, self._zeros, self._reported)
+        self._shown_units[taxels] = 0.0
         if self._memory is not None:
             self._memory.reset(taxels)
         self._set_apart(self._which, self._apart)

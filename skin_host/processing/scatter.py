@@ -17,7 +17,7 @@ same.
 Readings that are further apart show several moves of a hand, and a steady rhythm of it takes itself
 back. But what presses a chip's pads, which lie within three centimetres, moves them together, or
 one up as the other goes down; where the chip's connection is broken each reads what it likes. So
-of boards that send more seldom a pad is found only with the next one of its chip, if both scatter
+of boards that send more seldom a pad is found only with another one of its chip, if both scatter
 and the moves of one do not go with the other's.
 """
 
@@ -202,6 +202,11 @@ class Scatter:
             new.append(row)
             self._since_s = 0.0
         return new
+
+    def compare(self, beside: NDArray[np.intp]) -> None:
+        """Compare each pad with another one [m] from now on; see the class."""
+        self._together[beside != self._beside] = 0.0
+        self._beside = beside
 
     def wait(self) -> None:
         """Nothing touches: what was seen before is over."""

@@ -253,6 +253,7 @@ def test_taxels_that_grow_warm_under_a_hand_are_followed_and_reported(held, rate
 
 def test_two_minutes_of_a_steady_touch_are_not_reported():
     track = tracker()
+    follow(track, 0.0)
     warm(track, np.arange(N) < 6, 0.0, 120)
     assert not track.frozen.any()
 
@@ -530,6 +531,25 @@ def test_the_time_in_touch_is_reported_from_its_limit_on_and_fades_after_it():
     for _ in range(2):
         follow(track, 0.0)
     assert not track.frozen.any()
+
+
+def test_a_zero_that_no_reading_has_shown_to_be_right_is_uncertain_after_a_minute_of_touch():
+    """After a night it may be wrong, and pads read as touched though nothing touches them."""
+    track = tracker()
+    touched = np.arange(N) < 6
+    for _ in range(59):
+        follow(track, 0.0, touched, 25.0)
+    assert not track.frozen.any()
+    follow(track, 0.0, touched, 25.0)
+    assert np.array_equal(track.frozen, touched)
+    follow(track, 0.0)
+    for _ in range(300):
+        follow(track, 0.0, touched, 25.0)
+    assert not track.frozen.any()
+    track.renew(np.ones(N, bool), np.arange(N) < 3, Drift())
+    for _ in range(60):
+        follow(track, 0.0, touched, 25.0)
+    assert np.array_equal(track.frozen, np.arange(N) < 3)
 
 
 def test_without_tracking_no_touch_of_before_is_reported_for_ever():

@@ -5,7 +5,7 @@ import pytest
 
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.curves import KNOTS_UNITS, TableCurve
-from skin_host.processing.erratic import LIMIT, RELIEF_PER_S, Erratic, step_kpa
+from skin_host.processing.erratic import LIMIT, RELIEF_PER_S, Erratic, quieter_of_chip, step_kpa
 from skin_host.processing.pressure import PressureCurve
 
 STEP_KPA = 5.0
@@ -198,6 +198,37 @@ def test_pads_of_a_chip_that_are_not_valid_for_another_reason_decide_nothing_of_
     found.note_valid(np.ones(10, np.bool_))
     found.pass_time(1.0)
     assert np.flatnonzero(found.pads).tolist() == [0, 1, 2]
+
+
+def seldom_read(valid: np.ndarray) -> list[int]:
+    """The pads that are found of a chip whose contact is broken, read each 0.2 s for a minute.
+
+    All scatter alike; two had noise of nearly as much when they were calibrated.
+    """
+    rng = np.random.default_rng(5)
+    step = np.array([40.0, 300.0, 45.0, 310.0, 50.0, 55.0, 60.0])
+    found = Erratic(step, np.full(7, 300.0), np.zeros(7, int))
+    rows = np.where(valid, 450.0 + 80.0 * rng.normal(size=(300, 7)), 0.0).astype(np.float32)
+    for begin in range(0, len(rows), 5):
+        found.look(rows[begin : begin + 5], [0.2] * 5)
+        found.note_valid(valid)
+        found.pass_time(1.0)
+    return np.flatnonzero(found.pads).tolist()
+
+
+@pytest.mark.parametrize("missing", [None, 0, 5, 6])
+def test_a_pad_whose_noise_hides_its_scatter_or_is_not_valid_hides_no_other_of_a_slow_board(
+    missing: int | None,
+):
+    """Readings so far apart are compared with those of another pad of the chip."""
+    assert seldom_read(np.arange(7) != missing) == list(range(7))
+
+
+def test_each_pad_is_compared_with_the_next_quieter_one_of_its_chip():
+    chip = np.array([4, 4, 4, 1, 1, 9, 4])
+    watched = np.array([True] * 6 + [False])
+    step = np.array([9.0, 30.0, 8.0, 7.0, 7.0, 1.0, 1.0], np.float32)
+    assert quieter_of_chip(chip, watched, step).tolist() == [2, 0, 0, 4, 3, 5, 6]
 
 
 def test_pads_of_a_chip_are_read_again_as_soon_as_few_of_them_are_erratic():

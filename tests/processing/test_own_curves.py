@@ -12,7 +12,7 @@ from skin_host.processing.curves import Curves, CurveVerdict, Memory
 from skin_host.processing.drift import BaselineTracker
 from skin_host.processing.fitting.course import limit_kpa, make_memory
 from skin_host.processing.own_curves import RISE_UNITS_PER_S, OwnCurves
-from skin_host.processing.pipeline import ROWS
+from skin_host.processing.pipeline import ROWS, PressureFrame
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.smoothing import StepFilter
 from tests.processing.fitting.test_course import use_own_curves
@@ -465,10 +465,52 @@ def test_what_the_untouched_pads_show_is_followed_beside_what_was_hidden(common_
     own = OwnCurves(CURVE, curves(), slice(0, N), np.arange(N, dtype=np.int32), SMOOTHING_S)
     before = np.full(N, 2.0)
     drift = tracker(before)
-    drift.common_units = common_units
+    drift.shared_units = common_units
     drift.baseline[[1, 4]] += 2.0
     touched = np.isin(np.arange(N), [1, 4])
     assert own.hold_rises(drift, before, touched, 1.0, np.array([1])) is None
     shown = min(max(common_units, 0.0), RISE_UNITS_PER_S)
     assert drift.baseline[1] == pytest.approx(2.0 + RISE_UNITS_PER_S + shown)
-    assert drift.baseline[4] == 2.0
+    # A fall is followed in a touch.
+    assert drift.baseline[4] == pytest.approx(2.0 + min(common_units, 0.0))
+
+
+def drifting(rig: Rig, course_units: np.ndarray, press_units: float) -> list[PressureFrame]:
+    """The frames of seconds in which the whole skin drifts so far, and some pads are pressed."""
+    pressed = np.where(PRESSED, press_units, 0.0)
+    return [rig.step(units + pressed) for units in course_units for _ in range(5)]
+
+
+def held(course_units: np.ndarray) -> tuple[float, Rig]:
+    """By how much (kPa) a held pressure changes while the skin drifts so; and the skin then."""
+    rig = Rig(1, 0.4, seed=5, hz=5.0)
+    use_own_curves(rig, 0.4)
+    drifting(rig, np.zeros(5), 0.0)
+    frames = drifting(rig, np.concatenate([np.zeros(20), course_units]), 30.0)
+    first, last = (
+        np.mean([frame.pressure_kpa[PRESSED] for frame in part])
+        for part in (frames[50:100], frames[-50:])
+    )
+    return float(last - first), rig
+
+
+@pytest.mark.parametrize(("units", "period_s"), [(0.0, 60.0), (0.3, 60.0), (1.0, 240.0)])
+def test_what_drifts_to_and_fro_under_a_touch_leaves_no_pressure(units: float, period_s: float):
+    change_kpa, rig = held(units * np.sin(2.0 * np.pi * np.arange(360) / period_s))
+    assert change_kpa == pytest.approx(0.0, abs=2.5)
+    after = drifting(rig, np.zeros(20), 0.0)
+    assert not any(frame.touched.any() for frame in after[25:])
+
+
+def test_what_the_skin_has_warmed_by_while_it_held_something_is_no_touch_after_the_release():
+    """The pressure of what is held is too high by it, as a load that grows would read alike."""
+    change_kpa, rig = held(np.linspace(0.0, 5.0, 600))
+    assert change_kpa > 5.0
+    after = drifting(rig, np.full(20, 5.0), 0.0)
+    assert not any(frame.touched.any() for frame in after[25:])
+
+
+def test_a_grip_that_is_eased_to_a_third_stays_one_after_the_skin_has_warmed():
+    _, rig = held(np.linspace(0.0, 5.0, 600))
+    after = drifting(rig, np.full(60, 5.0), 10.0)
+    assert all(frame.touched[PRESSED].all() for frame in after)
