@@ -13,12 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from skin_host.errors import RequestError
 from skin_host.files import read_whole
 
-MAGIC = b"skin-emulator-state/9\n"
+MAGIC = b"skin-emulator-state/10\n"
 DIGEST_BYTES = 32
+#: Decimal places of positions (m) and of what else the digest has of a layout.
+PLACES = 9
 #: More than a robot of 100 000 taxels needs.
 MOST_BYTES = 2_000_000_000
 
@@ -156,7 +159,13 @@ def read(path: Path) -> bytes:
 
 
 def _digest(configuration: Sequence[Any]) -> bytes:
-    return hashlib.sha256(msgspec.json.encode(configuration[0])).digest()
+    settings, layout = configuration
+    found = hashlib.sha256(msgspec.json.encode(settings))
+    # Files that settings name may have changed, and so may the kinds of pads. Rounded: another
+    # computer's sine may differ in its last bit.
+    for array in (layout.position_m, layout.normal, layout.unit_ff, layout.sensitivity):
+        found.update((np.round(array, PLACES) + 0.0).tobytes())  # no -0.0
+    return found.digest()
 
 
 def _allowed(module: str, name: str, find: Any) -> object:

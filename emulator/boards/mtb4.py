@@ -185,10 +185,13 @@ class Mtb4(Mtb):
                 else:
                     self.next_ns = None
             case TactileSetup():
-                # All arguments are ignored: defaults, 40 ms, baseline, start.
+                # All arguments are ignored: the board's defaults, 40 ms, baseline, start. Triangles
+                # keep their shift, and chips get the offset if they have another.
+                shifts, offsets = self.shift, self.cdc_offset
                 self._defaults(period_ms=40, no_load=245)
+                self.shift, self.cdc_offset = shifts, offsets
                 for triangle in range(TRIANGLES):
-                    self._configure(triangle, int(self.shift[triangle]), DEFAULT_CDC_OFFSET)
+                    self._configure(triangle, int(shifts[triangle]), DEFAULT_CDC_OFFSET)
                 self._take_baseline()
                 self._start(t_ns)
 

@@ -35,8 +35,6 @@ from skin_host.errors import BusError, ConfigurationError
 
 #: One read takes at most this many frames, so that a flood cannot block the event loop.
 CAPACITY = 1024
-#: A controller that still has many errors reports one within this time.
-CALM_S = 10.0
 MULTICAST = "udp_multicast"
 SOCKETCAND = "socketcand"
 #: They take a frame at once, or never, and stamp it by this computer's clock.
@@ -109,11 +107,12 @@ class Stamps:
 
     They differ by what the freshest frame of some seconds seems to have waited. A clock that
     differs by a tenth of a period would make whole sweeps look cut, or boards as if they had
-    sent in the future.
+    sent in the future. A single stamp that is ahead may be damaged: two in a row show the clock.
     """
 
     def __init__(self) -> None:
         self._behind_s = 0.0
+        self._before_s = math.inf
         self._since_s = -math.inf
         self._least_s = math.inf
 
@@ -121,7 +120,9 @@ class Stamps:
         """Return the time on this computer's clock of a frame that is read now."""
         if not abs(stamp_s - now_s) <= PLAUSIBLE_S:
             return now_s
-        waited_s = now_s - stamp_s - self._behind_s
+        differs_s = now_s - stamp_s
+        before_s, self._before_s = self._before_s, differs_s
+        waited_s = differs_s - self._behind_s
         self._least_s = min(self._least_s, waited_s)
         if not 0 <= now_s - self._since_s < FRESH_S:
             # Frames that waited while this computer was busy come after fresh ones.
@@ -130,7 +131,7 @@ class Stamps:
                 waited_s -= self._least_s
             self._since_s, self._least_s = now_s, math.inf
         if waited_s < 0:
-            self._behind_s += waited_s
+            self._behind_s = min(self._behind_s, max(differs_s, before_s))
             return now_s
         return now_s - waited_s
 
@@ -162,7 +163,6 @@ class AdapterPort(Port):
         self._opening = opening
         self._unreadable = 0
         self._stamps = Stamps()
-        self._calm_at_s = 0.0
         self._id = np.zeros(CAPACITY, np.uint32)
         self._dlc = np.zeros(CAPACITY, np.uint8)
         self._data = np.zeros((CAPACITY, 8), np.uint8)
@@ -191,21 +191,17 @@ class AdapterPort(Port):
         batch = FrameBatch(self._id[:n], self._dlc[:n], self._data[:n], self._t_ns[:n])
         if errors:
             self._note_errors(batch)
-            self._calm_at_s = self._clock.monotonic_s() + CALM_S
-        elif n and self._is_over():
-            self._enter(LinkState.UP)
+        elif n:
+            self._note_calm()
         if self.state is not self._logged_state:
             self._log_state()
         return batch
 
-    def _is_over(self) -> bool:
-        """Whether a bus that receives has left the state that error frames reported.
-
-        Not every adapter reports the end, and over multicast anybody can send an error frame.
-        """
-        if self.state is LinkState.ERROR_PASSIVE:
-            return self._clock.monotonic_s() > self._calm_at_s
-        return self.state is LinkState.BUS_OFF
+    def _note_calm(self) -> None:
+        # Not every adapter reports the end of this, and over multicast anybody can send an error.
+        if self.state is LinkState.BUS_OFF:
+            self._enter(LinkState.UP)
+        super()._note_calm()
 
     def close(self) -> None:
         if (closing := self._shut_down()) is not None:

@@ -232,6 +232,9 @@ class _BoardState:
         stray: sweeps in succession with frames in another order.
         learn_after: so many sweeps pass before the order is learnt.
         crowded: see `Sweep`, since the last one that was returned.
+        sent_last_ns, sent_before_ns: time of the last frame of the last sweep, and of the one
+            before.
+        missed: see `Sweep`, of the last sweep.
         set_ns: by how much the clock was set since the last sweep before that.
     """
 
@@ -250,6 +253,8 @@ class _BoardState:
     lone: int = 0
     sent_first_ns: int = -(1 << 62)
     sent_last_ns: int = 0
+    sent_before_ns: int = 0
+    missed: int = 0
     set_ns: int = 0
     last_place: int = -1
     values: list[bytes] = field(default_factory=lambda: [_NOTHING] * 2 * TRIANGLES)
@@ -607,7 +612,7 @@ class Assembler:
         sweeps.append(Sweep(state.index, raw, status, present, last_ns, missed, state.crowded))
         state.crowded = False
         state.first_ns = state.sent_first_ns = first_ns
-        state.last_ns = state.sent_last_ns = last_ns
+        state.last_ns = last_ns
         return n
 
     def _take_run(
@@ -755,21 +760,29 @@ class Assembler:
             state.crowded = False
         state.sent = got
         state.sent_first_ns = state.first_ns
-        state.sent_last_ns = state.last_ns
         state.missing = 0
 
     def _count_sweep(self, state: _BoardState, last_ns: int) -> int:
         """Count a sweep and those missed since the board's last one; return the latter."""
         missed = 0
         passed_ns = last_ns - state.sent_last_ns
+        if abs(passed_ns) > _SET_BACK_NS:
+            # A time that is far from those before and after it, which are near each other, is a
+            # damaged stamp: no time passed up to it, or from it on.
+            since_ns = last_ns - state.sent_before_ns
+            if abs(since_ns) < min(abs(passed_ns), abs(passed_ns - since_ns)):
+                self.counters.missed -= state.missed
+                passed_ns, state.sent_last_ns = since_ns, state.sent_before_ns
+        state.sent_before_ns, state.sent_last_ns = state.sent_last_ns, last_ns
         if state.set_ns:
             unset_ns = passed_ns - state.set_ns
             # Not so while sweeps follow that were stamped before the clock was set.
             if abs(unset_ns - state.period_ns) < abs(passed_ns - state.period_ns):
                 passed_ns, state.set_ns = unset_ns, 0
-        if state.sent_last_ns and 2 * passed_ns >= 3 * state.period_ns:
+        if state.sent_before_ns and 2 * passed_ns >= 3 * state.period_ns:
             missed = round(passed_ns / state.period_ns) - 1
             self.counters.missed += missed
+        state.missed = missed
         self.counters.sweeps += 1
         return missed
 

@@ -11,7 +11,7 @@ back or forward changes nothing. While nothing is read, or old frames are read, 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import median
 
 import numpy as np
@@ -50,10 +50,13 @@ ZEROING_SWEEPS = 3
 WRONG_PERIOD = 0.25
 #: For a regular board all intervals, except the longest and shortest fifth, lie within this share.
 UNEVEN = 0.1
-#: Two boards send at one address when so many times as many sweeps come as of one board, for this
-#: long, and some of them too soon after the one before.
+#: Two boards send at one address when some triangle comes so many times as often as of one board,
+#: for this long, and some sweeps too soon after the one before.
 TWICE_SWEEPS = 1.4
 TWICE_NS = 2_000_000_000
+#: Where both send at the same moments, most triangles are cut, and so many sweeps a period come, of
+#: one triangle or a few each. Frames that are late cut a sweep into two or three.
+CUT_SWEEPS = 4.0
 #: What waited while this computer was busy comes too soon as well, but in one burst.
 BURST_NS = 250_000_000
 #: It is over when so much time's sweeps of one board have come, none of them too soon.
@@ -78,6 +81,7 @@ class _Crowd:
         counted_ns, counted: time and number of the sweep from which on they are counted.
         last_ns, last: time and number of the last that came too soon.
         apart: how many of those that are counted did not.
+        came: int64[16], how many of those that are counted had each triangle.
     """
 
     since_ns: int
@@ -86,6 +90,34 @@ class _Crowd:
     last_ns: int
     last: int
     apart: int = 0
+    came: NDArray[np.int64] = field(default_factory=lambda: np.zeros(TRIANGLES, np.int64))
+
+    def is_of_two(self, number: int, periods: float) -> bool:
+        """Whether what came in so many periods, up to the sweep of this number, is of two boards.
+
+        The same frames make more sweeps where some are late.
+        """
+        many = TWICE_SWEEPS * periods
+        return number - self.counted > many and (
+            int(self.came.max()) > many or number - self.counted > CUT_SWEEPS * periods
+        )
+
+
+class Allowance:
+    """How much is processed of a board that may send far too often: it is broken, or hostile."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._taken = 0.0
+        self._t_ns = 0
+
+    def is_excess(self, t_ns: int) -> bool:
+        """Return whether what came at this time is too much to be processed."""
+        passed_ns, self._t_ns = max(t_ns - self._t_ns, 0), t_ns
+        taken = max(self._taken - MOST_OFTEN * passed_ns / self._period_ns, 0.0)
+        excess = (taken + 1.0) * self._period_ns > MOST_WAITING_NS
+        self._taken = taken if excess else taken + 1.0
+        return excess
 
 
 class BoardLedger:
@@ -162,10 +194,8 @@ class BoardLedger:
         self._since_set_up = [0] * n
         self.twice: dict[int, int] = {}
         self._crowds: dict[int, _Crowd] = {}
-        #: Of each board, how many of its sweeps came too soon of late, up to when, and whether the
-        #: last one is too much.
-        self._early = [0.0] * n
-        self._early_ns = [0] * n
+        #: Of each board, of its sweeps that come too soon, and whether the last one is too much.
+        self._early = [Allowance(period_ns) for period_ns in self._period_ns.tolist()]
         self._is_excess = [False] * n
         self.excess = np.zeros(n, np.int64)
         self.silences = np.zeros(n, np.int64)
@@ -207,7 +237,8 @@ class BoardLedger:
             self._note_interval(row, sweep.t_ns - before.t_ns)
         self._since_set_up[row] += 1
         if sweep.crowded or self._crowds:
-            self._is_excess[row] = sweep.crowded and self._note_early(row, sweep.t_ns)
+            excess = self._is_excess[row] = sweep.crowded and self._early[row].is_excess(sweep.t_ns)
+            self.excess[row] += excess
             self._note_crowd(row, sweep)
         if sweep.present != self._present[row]:
             self._present[row] = sweep.present
@@ -342,6 +373,8 @@ class BoardLedger:
         """
         crowd, t_ns, number = self._crowds.get(row), sweep.t_ns, int(self.sweeps[row])
         period_ns = int(self._period_ns[row])
+        if crowd is not None:
+            crowd.came += triangles_in(sweep.present)
         if not sweep.crowded:
             if crowd is not None:
                 crowd.apart += 1
@@ -358,25 +391,15 @@ class BoardLedger:
         crowd.last_ns, crowd.last = t_ns, number
         if t_ns - crowd.since_ns < BURST_NS:
             crowd.counted_ns, crowd.counted, crowd.apart = t_ns, number, 0
+            crowd.came[:] = 0
         elif t_ns - crowd.since_ns >= TWICE_NS:
             passed_ns = t_ns - crowd.counted_ns
             apart = crowd.apart * period_ns / passed_ns
-            many = (number - crowd.counted) * period_ns > TWICE_SWEEPS * passed_ns
-            if many and apart > APART_SHARE:
+            if crowd.is_of_two(number, passed_ns / period_ns) and apart > APART_SHARE:
                 self.twice.setdefault(row, crowd.since_ns)
             elif apart < LEAST_APART_SHARE:
                 self.twice.pop(row, None)
             self._crowds[row] = _Crowd(t_ns, t_ns, number, t_ns, number)
-
-    def _note_early(self, row: int, t_ns: int) -> bool:
-        """Count a sweep that came too soon; return whether it is one too many."""
-        period_ns = int(self._period_ns[row])
-        passed_ns, self._early_ns[row] = max(t_ns - self._early_ns[row], 0), t_ns
-        early = max(self._early[row] - MOST_OFTEN * passed_ns / period_ns, 0.0)
-        is_excess = (early + 1.0) * period_ns > MOST_WAITING_NS
-        self._early[row] = early if is_excess else early + 1.0
-        self.excess[row] += is_excess
-        return is_excess
 
     def _note_interval(self, row: int, interval_ns: int) -> None:
         if not 0 < interval_ns < STALE_INTERVALS_NS:

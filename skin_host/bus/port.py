@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 CHECK_S = 0.25
 #: After bus-off the kernel may need this long to report that the carrier is gone.
 _CARRIER_S = 1.5
+#: A controller that still has many errors reports one within this time.
+CALM_S = 10.0
 #: A frame that the interface does not take within this time is dropped.
 SEND_DEADLINE_S = 1.0
 _SEND_RETRY_S = 0.002
@@ -142,6 +144,7 @@ class Port(ABC):
         self._told_at_s = -2 * _LONGEST_QUIET_S
         self._quiet_s = _QUIET_S
         self._check_at_s = 0.0
+        self._calm_at_s = 0.0
 
     @abstractmethod
     def read(self) -> FrameBatch:
@@ -265,6 +268,7 @@ class Port(ABC):
 
     def _note_errors(self, batch: FrameBatch) -> None:
         """Count a batch's error frames and derive the link's state from them."""
+        before = self.counters.error_frames
         for row in np.flatnonzero(batch.id & np.uint32(ERROR_FLAG)).tolist():
             self.counters.error_frames += 1
             error, detail = int(batch.id[row]), int(batch.data[row, 1])
@@ -278,3 +282,10 @@ class Port(ABC):
                 self._enter(LinkState.BUS_OFF)
             if error & _ERROR_RESTARTED:
                 self._enter(LinkState.UP)
+        if self.counters.error_frames != before:
+            self._calm_at_s = self._clock.monotonic_s() + CALM_S
+
+    def _note_calm(self) -> None:
+        """Note that frames came, and no error: not every driver reports the end of many errors."""
+        if self.state is LinkState.ERROR_PASSIVE and self._clock.monotonic_s() > self._calm_at_s:
+            self._enter(LinkState.UP)

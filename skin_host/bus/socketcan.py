@@ -312,6 +312,8 @@ class SocketCanPort(Port):
                 self._enter(LinkState.UP)
             if self._receiver.saw_flags(n):
                 self._note_errors(batch)
+            if self.state is LinkState.ERROR_PASSIVE:
+                self._note_calm()
         if self.state is not LinkState.UP and self._time_to_check():
             self._check_link()
         if self.state is not self._logged_state:

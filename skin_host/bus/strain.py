@@ -33,6 +33,8 @@ PAIR_NS_PER_MS = 750_000
 NEXT_NS = 300_000
 NEXT_SHARE = 1 / 6
 PAUSE_SHARE = 1 / 2
+#: No frame comes sooner after the one before, on any bus. What is read later at once may seem to.
+FRAME_NS = 50_000
 #: By so many samples more of the other order than of the known one, the other becomes the known.
 ORDER_SAMPLES = 8
 
@@ -166,8 +168,9 @@ class StrainCounters:
         lone: frames whose other half did not arrive in time.
         late: of these, those whose other half came next, but later.
         saturated: samples with a saturated channel.
-        doubled: frames that came twice in a row.
+        doubled: frames that came twice in a row, alone or as both halves of a sample.
         wrong_length: frames that were neither force nor torque.
+        excess: samples that were too many to be processed.
     """
 
     samples: int = 0
@@ -176,6 +179,7 @@ class StrainCounters:
     saturated: int = 0
     doubled: int = 0
     wrong_length: int = 0
+    excess: int = 0
 
 
 class _Half(NamedTuple):
@@ -207,7 +211,8 @@ class _TooMany:
     def take(self, t_ns: int) -> None:
         """Take in the time of a frame."""
         since_ns = self._since_ns
-        if since_ns is None or t_ns < since_ns:
+        # After a pause, or a wrong time stamp, what was found holds until it is decided again.
+        if since_ns is None or not 0 <= t_ns - since_ns < 2 * TWICE_NS:
             self._since_ns = self._counted_ns = t_ns
             self._counted = 0
         elif t_ns - since_ns < BURST_NS:
@@ -267,6 +272,9 @@ class WrenchAssembler:
         #: force than torque.
         self._first: int | None = None
         self._force_first = 0
+        #: The last sample, and the last force.
+        self._sample: tuple[_Half, _Half] | None = None
+        self._force: _Half | None = None
 
     @property
     def twice(self) -> bool:
@@ -294,7 +302,10 @@ class WrenchAssembler:
                 self.counters.doubled += 1
                 continue
             if kind == LOADS:
-                self._too_many.take(t_ns)
+                # What is passed on twice is not of two boards.
+                if self._force is None or not self._repeats(self._force, half):
+                    self._too_many.take(t_ns)
+                self._force = half
             sample = self._pair(half)
             if sample is not None:
                 samples.append(sample)
@@ -307,12 +318,11 @@ class WrenchAssembler:
         The board itself sends the same type a period later.
         """
         before = self._before
-        return (
-            before is not None
-            and not half.begins
-            and (before.kind, before.saturated) == (half.kind, half.saturated)
-            and bool((before.value == half.value).all())
-        )
+        return before is not None and not half.begins and _equal(before, half)
+
+    def _repeats(self, before: _Half, half: _Half) -> bool:
+        """Whether a half is an earlier one once more, passed on twice with others between them."""
+        return FRAME_NS <= half.t_ns - before.t_ns < self._pause_ns and _equal(before, half)
 
     def _pair(self, half: _Half) -> Wrench | None:
         before, self._before = self._before, half
@@ -341,10 +351,22 @@ class WrenchAssembler:
         if self._first is None or abs(self._force_first) == ORDER_SAMPLES:
             self._first = first
 
-    def _joined(self, first: _Half, second: _Half) -> Wrench:
+    def _joined(self, first: _Half, second: _Half) -> Wrench | None:
+        """Return the sample of two halves; None if it is the last one once more."""
+        before, self._sample = self._sample, (first, second)
+        if before is not None and all(map(self._repeats, before, self._sample)):
+            self.counters.doubled += 2
+            return None
         in_order = first.kind == StrainType.FORCE
         force, torque = (first, second) if in_order else (second, first)
         saturated = first.saturated or second.saturated
         self.counters.samples += 1
         self.counters.saturated += saturated
         return Wrench(second.t_ns, force.value, torque.value, saturated)
+
+
+def _equal(one: _Half, other: _Half) -> bool:
+    """Whether two halves are of the same type and have the same values."""
+    return (one.kind, one.saturated) == (other.kind, other.saturated) and bool(
+        (one.value == other.value).all()
+    )

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from skin_host.bus.ledger import INTERVALS, STALE_INTERVALS_NS, is_period, regular_ns
+from skin_host.bus.ledger import (
+    INTERVALS,
+    STALE_INTERVALS_NS,
+    Allowance,
+    is_period,
+    regular_ns,
+)
 from skin_host.bus.strain import (
     CHANNELS,
     LOADS,
@@ -76,6 +82,7 @@ class TipState:
         intervals_ns: between its last samples, by their time stamps.
         came, sampled: a frame of it, and a whole sample, was read since boards were last looked at.
         awaited: the board is being set up and has not had the time to send yet.
+        allowance: how many of its samples are processed.
         zeroing, touching: samples of which a zero is taken, and whether it was touched in each.
     """
 
@@ -107,6 +114,10 @@ class TipState:
     awaited: bool = False
     zeroing: list[Floats] = field(default_factory=list)
     touching: list[bool] = field(default_factory=list)
+    allowance: Allowance = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.allowance = Allowance(self.settings.period_ms * 1_000_000)
 
     @property
     def samples(self) -> int:
@@ -258,6 +269,9 @@ class FingertipEngine:
             if state.assembler is not None:
                 for wrench in state.assembler.take(frames, batch.t_ns):
                     self._note_sample(state, wrench)
+                    if state.allowance.is_excess(wrench.t_ns):
+                        state.assembler.counters.excess += 1
+                        continue
                     felt.samples.append((state.number, wrench.t_ns))
                     felt.events.extend(self._step(state, wrench))
         return felt

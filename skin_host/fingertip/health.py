@@ -41,6 +41,7 @@ class FingertipRecord(TypedDict):
     saturated: int
     doubled: int
     wrong_length: int
+    excess: int
     silences: int
     full_scale: list[float] | None
     threshold_n: float
@@ -92,6 +93,7 @@ class FingertipHealth:
             "saturated": counters.saturated,
             "doubled": counters.doubled,
             "wrong_length": counters.wrong_length,
+            "excess": counters.excess,
             "silences": state.silenced,
             "full_scale": None if assembler is None else assembler.full_scale.tolist(),
             "threshold_n": round(state.tip.threshold_n, 4),

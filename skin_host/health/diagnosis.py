@@ -271,7 +271,11 @@ def _board(board: BoardHealth, load: float) -> Iterator[FoundFault]:
     if events.get("tx_overflows"):
         yield fault("board_overflows", " could not send all its frames: bus too full")
     if board.get("twice"):
-        yield fault("board_twice", ": two boards send at this address; give one of them another")
+        yield fault(
+            "board_twice",
+            ": two boards send at this address, or two gateways pass its frames on; give each "
+            "board an address of its own, and its bus one gateway",
+        )
         return
     wanted, seen, jitter_ms = board["period_ms"], board["period_seen_ms"], board["jitter_ms"]
     if events.get("excess"):
@@ -401,8 +405,8 @@ def _taxels(record: Record) -> Iterator[FoundFault]:
         yield fault(
             "taxel_held",
             record["baseline_frozen"],
-            "touched for so long, or with so much drift during the touch, that the zero is "
-            "uncertain",
+            "touched for so long, ever since the zero came into use, or with so much drift "
+            "meanwhile, that the zero is uncertain; if nothing touches: skin command calibrate",
         )
 
 

@@ -307,3 +307,25 @@ def test_stamps_follow_a_clock_that_runs_slowly_and_keep_what_waited() -> None:
         sent_s = paused_s + 0.05 * number
         stamp_s = stamps.here(began_s + (sent_s - began_s) * slow, now_s)
         assert abs(stamp_s - sent_s) < 0.02
+
+
+@pytest.mark.parametrize("wrong_s", [3000.0, 40.0, 0.3])
+def test_one_stamp_that_is_ahead_does_not_move_those_after_it(wrong_s: float) -> None:
+    """Frames of the next four seconds seemed to be as old as it was ahead."""
+    stamps = Stamps()
+    now_s = 1_700_000_000.0
+    for number in range(400):
+        now_s += 0.05
+        ahead_s = wrong_s if number == 100 else 0.0
+        assert now_s - 0.005 < stamps.here(now_s - 0.001 + ahead_s, now_s) <= now_s
+
+
+@pytest.mark.parametrize("ahead_s", [3000.0, -3000.0, 0.3])
+def test_stamps_of_a_clock_that_is_ahead_are_brought_to_this_one(ahead_s: float) -> None:
+    stamps = Stamps()
+    now_s = 1_700_000_000.0
+    late = []
+    for _ in range(400):
+        now_s += 0.05
+        late.append(now_s - stamps.here(now_s - 0.001 + ahead_s, now_s))
+    assert all(abs(late_s) < 0.005 for late_s in late)

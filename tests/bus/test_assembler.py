@@ -769,3 +769,23 @@ def test_sweeps_are_not_missed_in_time_that_only_the_clock_passed(
         feed(assembler, frames(values(4, number), begun_ns + number * PERIOD + step_ns))
     assert assembler.counters.missed == lost
     assert assembler.counters.sweeps == 15 - lost
+
+
+@pytest.mark.parametrize("wrong_ns", [3600 * 10**9, -3600 * 10**9, -(10**9), -(1 << 60), 1 << 60])
+@pytest.mark.parametrize("place", [0, 3, 7])
+@pytest.mark.parametrize("lost", [0, 2])
+def test_one_wrong_time_stamp_is_no_time_in_which_sweeps_were_missed(
+    wrong_ns: int, place: int, lost: int
+) -> None:
+    """One that was an hour ahead added 71999 missed periods; what was lost is counted."""
+    begun_ns = 10_000 * 1_000_000_000
+    assembler = make()
+    missed = []
+    for number in [*range(5), *range(5 + lost, 12)]:
+        sent = frames(values(4, number), begun_ns + number * PERIOD)
+        if number == 5 + lost:
+            sent[place] = (*sent[place][:2], sent[place][2] + wrong_ns)
+        for frame in sent:
+            missed += [sweep.missed for sweep in feed(assembler, [frame])]
+    assert assembler.counters.missed == lost
+    assert sum(missed) == lost

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.bus.assembler import Sweep
+from skin_host.bus.assembler import Assembler, Sweep
 from skin_host.bus.ledger import (
     ALONE_NS,
     LONGEST_PAUSE_NS,
@@ -18,6 +18,7 @@ from skin_host.bus.ledger import (
     TWICE_NS,
     BoardLedger,
 )
+from skin_host.bus.wire import FrameBatch, encode_sweep, triangles_in
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings, load
 from skin_host.layout import BoardLayout, build_layout
 from tests.support.stack import ROOT
@@ -519,6 +520,31 @@ def test_sweeps_that_two_boards_cut_into_pieces_are_of_two() -> None:
         for number in range(15):
             address.note(address.t_ns + number * MS // 2)
     assert address.twice
+
+
+@pytest.mark.parametrize("late_ms", [26, 30, 40, 49])
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.3])
+def test_frames_of_one_board_that_are_late_are_not_of_two(late_ms: int, share: float) -> None:
+    """A tenth of the frames, 30 ms late, made a board's readings invalid as of two boards."""
+    known, rng = ledger(), np.random.default_rng(1)
+    assembler = Assembler(boards()[:1], close_periods=0.9)
+    address, triangles = (
+        boards()[HAND][1].settings.address,
+        np.flatnonzero(triangles_in(enabled(0))),
+    )
+    sent: list[tuple[int, bytes, int]] = []
+    for number in range(400):
+        raw = rng.integers(100, 200, (len(triangles), 12), np.uint8)
+        ids, data = encode_sweep(address, triangles, raw, np.zeros(len(triangles), np.uint16))
+        late_ns = late_ms * MS * (rng.random(len(ids)) < share)
+        sent += [
+            (int(one), row.tobytes(), T0 + number * PERIOD + place * MS // 8 + int(late))
+            for place, (one, row, late) in enumerate(zip(ids, data, late_ns, strict=True))
+        ]
+    sent.sort(key=lambda frame: frame[2])
+    for sweep in assembler.feed(FrameBatch.of(sent)).sweeps:
+        known.note(sweep)
+        assert not known.twice
 
 
 def flooded(seconds: float, every_ms: float) -> BoardLedger:

@@ -181,6 +181,29 @@ def test_frames_without_stamps_have_the_time_at_which_they_are_read(ends):
     assert (port.read().t_ns >= before_ns - SET_NS).all()
 
 
+def test_a_bus_without_errors_for_ten_seconds_is_up_whatever_its_driver_reports(ends):
+    """That of the MCP2515 reports no return from error passive."""
+    ours, theirs = ends
+    clock = SteppedClock()
+    port = port_on(ours, clock=clock)
+
+    def state_after(seconds: float, sent: bytes) -> LinkState:
+        clock.advance(seconds)
+        theirs.socket.send(sent)
+        port.read()
+        return port.state
+
+    passive, data = can_frame(0x20000004, bytes([0, 0x20, *bytes(6)])), can_frame(0x410, bytes(8))
+    for _ in range(3):
+        assert state_after(1.0, passive) is LinkState.ERROR_PASSIVE
+    assert state_after(9.0, passive) is LinkState.ERROR_PASSIVE
+    assert state_after(9.0, data) is LinkState.ERROR_PASSIVE
+    clock.advance(60.0)
+    port.read()
+    assert port.state is LinkState.ERROR_PASSIVE
+    assert state_after(0.0, data) is LinkState.UP
+
+
 def test_a_frame_with_the_error_bit_is_an_error_whatever_else_it_is(ends):
     """The kernel's own filters (net/can/af_can.c) ask for this bit first, and no identifier has
     it."""

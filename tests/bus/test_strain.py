@@ -139,6 +139,68 @@ def test_frames_that_come_twice_in_a_row_are_taken_once(order, copies, late_ms, 
     assert np.round(found).tolist() == values
 
 
+@pytest.mark.parametrize("order", ["ft", "tf"])
+@given(
+    apart_ms=st.floats(0.15, 4.8),
+    lost=st.sets(st.integers(3, 39)),
+    values=st.lists(st.integers(-2, 2), min_size=40, max_size=40),
+)
+def test_samples_that_two_gateways_pass_on_are_taken_once(order, apart_ms, lost, values):
+    """Whichever of them passes some samples on alone; two of the board may be equal."""
+    came = [
+        (10 * i + 0.1 * k + apart_ms * copy, kind, values[i])
+        for i in range(40)
+        for copy in range(1 if i in lost or i < 3 else 2)
+        for k, kind in enumerate(order)
+    ]
+    came.sort(key=lambda frame: frame[0])
+    assembler = WrenchAssembler(13, 10, SCALE)
+    samples = samples_of(assembler, stream(*came))
+    found = [s.force_n[0] * 0x8000 / SCALE[0] for s in samples]
+    assert np.round(found).tolist() == values
+    assert assembler.counters.doubled == len(came) - 2 * 40
+    assert assembler.counters.lone == 0
+
+
+@pytest.mark.parametrize("apart_ms", [0.05, 0.15, 0.7, 1.4])
+def test_samples_that_come_twice_are_not_of_two_boards(apart_ms):
+    came = [
+        (3 * i + 0.13 * k + apart_ms * copy, kind, i % 1000)
+        for i in range(2000)
+        for copy in range(2)
+        for k, kind in enumerate("ft")
+    ]
+    came.sort(key=lambda frame: frame[0])
+    assembler = WrenchAssembler(13, 3, SCALE)
+    samples_of(assembler, stream(*came))
+    assert not assembler.twice
+
+
+@pytest.mark.parametrize("wrong_ms", [3.6e6, -3.6e6, 5e3])
+def test_one_wrong_time_stamp_does_not_end_two_boards(wrong_ms):
+    came = [
+        (3600_000 + 3 * i + 0.13 * k + 1.1 * copy, kind, 2 * i + copy)
+        for i in range(4000)
+        for copy in range(2)
+        for k, kind in enumerate("ft")
+    ]
+    came[8000] = (came[8000][0] + wrong_ms, *came[8000][1:])
+    assembler = WrenchAssembler(13, 3, SCALE)
+    twice = []
+    for frame in came:
+        samples_of(assembler, stream((frame[0], frame[1], frame[2] % 1000)))
+        twice.append(assembler.twice)
+    assert all(twice[5000:])
+
+
+def test_equal_samples_that_waited_and_were_stamped_at_once_are_not_doubled():
+    assembler = WrenchAssembler(13, 10, SCALE)
+    learn = [(10 * i + 0.1 * k, kind, i) for i in range(3) for k, kind in enumerate("ft")]
+    waited = [(90 + 0.01 * i, kind, 7) for i in range(6) for kind in "ft"]
+    assert len(samples_of(assembler, stream(*learn, *waited))) == 9
+    assert assembler.counters.doubled == 0
+
+
 def test_a_lost_half_never_joins_two_samples():
     assembler = WrenchAssembler(13, 10, SCALE)
     samples = samples_of(

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,16 @@ def test_a_state_of_another_configuration_is_refused() -> None:
 
     with pytest.raises(StateError, match="of another configuration"):
         Robot.restore(robot.save(), *other)
+
+
+def test_a_state_of_taxels_that_were_moved_since_is_refused() -> None:
+    """Settings name files of positions; what presses would lie where taxels were before."""
+    settings, layout = skin()
+    robot = Robot(settings, layout)
+    Robot.restore(robot.save(), *skin())
+    moved = replace(layout, position_m=layout.position_m + 1e-3)
+    with pytest.raises(StateError, match="of another configuration"):
+        Robot.restore(robot.save(), settings, moved)
 
 
 def test_a_damaged_or_foreign_file_is_refused_in_one_line(tmp_path: Path) -> None:

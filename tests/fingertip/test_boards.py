@@ -18,6 +18,7 @@ from emulator.probes.scene import Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.answers import answer_frame
 from skin_host.bus.commands import SetTransmissionPeriod, command_frame
+from skin_host.bus.ledger import MOST_OFTEN, MOST_WAITING_NS
 from skin_host.bus.strain import FullScale, StrainType, Wrench, start_frames
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import changed, load
@@ -195,6 +196,34 @@ async def test_a_board_that_sends_in_another_period_is_named_and_set_up_again(
     bench.sent.clear()
     await bench.run(10.0)
     assert bench.sent == []
+
+
+async def test_of_a_board_that_floods_its_bus_so_many_samples_are_processed() -> None:
+    bench = await calibrated()
+    state = bench.tips.tips["index"]
+    begun_ns, processed = bench.robot.t_ns, 0
+    before = state.samples
+    for turn in range(1000):
+        t_ns = begun_ns + turn * 20_000_000
+        frames = [
+            (
+                *encode_strain(1, kind, (turn % 7, number, 0)),
+                t_ns + number * 400_000 + kind * 1_000,
+            )
+            for number in range(50)
+            for kind in (StrainType.FORCE, StrainType.TORQUE)
+        ]
+        processed += len(bench.engine.feed("can0", FrameBatch.of(frames)).samples)
+        bench.engine.expire(t_ns + 20_000_000)
+    assert state.samples - before == 50_000
+    assert bench.record()["excess"] == 50_000 - processed
+    at_once, later = MOST_WAITING_NS / 3e6, MOST_OFTEN * 20e9 / 3e6
+    assert abs(processed - (at_once + later)) <= 4
+    # It is processed in whole again when that is over.
+    excess = bench.record()["excess"]
+    bench.ahead_ns = 20_000_000_000
+    await bench.run(1.0)
+    assert bench.record()["excess"] == excess
 
 
 async def test_a_board_that_cannot_send_in_its_period_is_set_up_ever_more_seldom() -> None:

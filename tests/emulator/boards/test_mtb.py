@@ -58,6 +58,13 @@ def started(model: str = "mtb4", *, skin_type: int = 2, triangles: int = 1) -> B
     return bench
 
 
+def word_at(bench: BoardOnBench, register: int) -> int:
+    """What the first chip has in a register."""
+    chip = bench.chips[0]
+    chip.write(register.to_bytes(2, "big"))
+    return int.from_bytes(chip.read(2), "big")
+
+
 # ---------------------------------------------------------------------- data frames
 
 
@@ -363,6 +370,22 @@ def test_command_4c_starts_with_defaults_whatever_it_says() -> None:
     frames = bench.run(0.4)
     assert len(frames) == 10 * 32
     assert bench.triangle(frames, 0) == ([245] * 12, 0)
+
+
+def test_command_4c_gives_chips_its_cdc_offset_and_triangles_keep_their_shift() -> None:
+    """theSkin set(SKIN_OBSOLETE_TACT_SETUP): each offset that differs is written."""
+    bench = started()
+    bench.say(SetTriangleConfig(0, 0, shift=4, cdc_offset=0x2000))
+    bench.run(0.1)
+    assert word_at(bench, 0x082) == 0x2000
+    bench.say(TactileSetup())
+    assert word_at(bench, 0x082) == 0x2200
+    bench.run(0.1)
+    # Its baseline is of before, as after command 50, until that is sent again.
+    bench.say(TactileSetup())
+    bench.chips[0].set_capacitance_ff(3, RESTING_FF + 0.36 * 160)
+    bench.run(0.1)
+    assert bench.triangle(bench.run(0.04), 0)[0][3] == 245 - (160 >> 4)
 
 
 def test_a_board_hears_its_address_and_the_broadcast_from_anyone() -> None:
