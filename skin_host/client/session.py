@@ -265,7 +265,7 @@ class SkinClient:
             return bool(made) and all(link.has(want) for link in made)
 
         await self._until(is_ready)
-        self._refuse_unread(lambda wanted: wanted.nodes.union(*map(wanted.required, self._streams)))
+        self._refuse_unread(lambda one: set(one.nodes).union(*map(one.required, self._streams)))
 
     async def info(self, timeout_s: float = 5.0) -> dict[str, NodeInfo]:
         """Return the descriptions of the robot's nodes: parts, taxels, places.
@@ -282,7 +282,7 @@ class SkinClient:
                 await self._until(lambda: self._nodes.are_described)
         known = {name: node.info for name, node in self.nodes.items() if node.info is not None}
         if not known:
-            self._refuse_unread(lambda subscriptions: subscriptions.nodes)
+            self._refuse_unread(lambda subscriptions: set(subscriptions.nodes))
             raise BrokerError(
                 f'broker {self.where}: no node of robot "{self.robot}" published its info; '
                 "is `skin run` running?"

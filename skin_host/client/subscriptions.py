@@ -31,10 +31,10 @@ class Subscriptions:
         self._streams = streams
 
     @property
-    def nodes(self) -> set[str]:
+    def nodes(self) -> tuple[str, ...]:
         """The topics of what the nodes are, and whether they are online."""
         topics = self.topics
-        return {topics.node("status", "+"), topics.info("+"), topics.info("+", "+")}
+        return topics.node("status", "+"), topics.info("+"), topics.info("+", "+")
 
     def of(self, kind: PartTopic, part: str | None) -> set[str]:
         """Return the topics by which a kind of message of a part, or of all, may come."""
@@ -45,8 +45,8 @@ class Subscriptions:
         kinds = {one for kind in stream.kinds for one in needed(kind)}
         if "contact" in stream.kinds:
             kinds.remove("touch")  # it is of use to `present` alone
-        nodes = self.nodes if "info" in stream.kinds else set()
-        return nodes.union(*(self.of(kind, stream.part) for kind in kinds))
+        nodes = self.nodes if "info" in stream.kinds else ()
+        return set(nodes).union(*(self.of(kind, stream.part) for kind in kinds))
 
     def kinds_of(self, part: str) -> set[PartTopic]:
         """Return the kinds of messages of a part that somebody reads."""
@@ -59,9 +59,7 @@ class Subscriptions:
         Nodes come first: what is retained of a part whose node has stopped is out of date. Contact
         states come before what shows that their part lives, or that would not be known of them.
         """
-        yield self.topics.node("status", "+")
-        yield self.topics.info("+")
-        yield self.topics.info("+", "+")
+        yield from self.nodes
         yield self.replies
         asked = {
             (kind, stream.part)

@@ -9,13 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from skin_host.bus.ledger import (
-    INTERVALS,
-    STALE_INTERVALS_NS,
-    Allowance,
-    is_period,
-    regular_ns,
-)
+from skin_host.bus.ledger import INTERVALS, STALE_INTERVALS_NS, Allowance, is_period, regular_ns
 from skin_host.bus.strain import (
     CHANNELS,
     LOADS,
