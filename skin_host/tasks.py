@@ -15,6 +15,21 @@ async def cancel(*tasks: "asyncio.Future[Any]") -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
+def leave_if_cancelled() -> None:
+    """End this task if it was cancelled, for loops that try again after an error.
+
+    A wait that fails at the moment of the cancellation raises its error in place of it
+    (`asyncio.wait_for` and `asyncio.TaskGroup` of Python 3.11): the loop would go on, and who
+    cancelled it would wait for ever.
+
+    Raises:
+        CancelledError: it was.
+    """
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+
+
 async def until(stop: asyncio.Event, work: Coroutine[Any, Any, T]) -> T | None:
     """Work until `stop` is set, and return the result of work that ends before.
 

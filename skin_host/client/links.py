@@ -23,6 +23,7 @@ from skin_host.mqtt.connection import (
 )
 from skin_host.mqtt.payload import MAX_PACKET_BYTES
 from skin_host.mqtt.topics import ONLINE
+from skin_host.tasks import leave_if_cancelled
 
 MAX_INCOMING = 10_000
 #: The broker keeps touch events for this long while we are disconnected (MQTT 5).
@@ -122,6 +123,7 @@ class BrokerLink:
                 self._kept |= self._subscribed
                 self._subscribed, self.refused = set(), set()
                 self._hearer.note(self)
+            leave_if_cancelled()
             await asyncio.sleep(retry.delay_s(0.0 if since_s is None else loop.time() - since_s))
 
     def _note_loss(self, error: BaseException) -> None:

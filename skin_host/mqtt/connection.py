@@ -326,15 +326,16 @@ class Connection(aiomqtt.Client):
     async def _wait_for(self, fut: Any, timeout: float | None) -> Any:  # noqa: ASYNC109  # aiomqtt names it
         """Wait as aiomqtt does, and never lose a cancellation.
 
-        The `asyncio.wait_for` of Python 3.11 loses one that comes together with the result. The
-        task then continues, and the canceller waits for ever.
+        The `asyncio.wait_for` of Python 3.11 loses one that comes together with the result, or
+        with the error. The task then continues, and the canceller waits for ever.
         """
         task = asyncio.current_task()
         before = task.cancelling() if task else 0
-        result = await super()._wait_for(fut, timeout)
-        if task and task.cancelling() > before:
-            raise asyncio.CancelledError
-        return result
+        try:
+            return await super()._wait_for(fut, timeout)
+        finally:
+            if task and task.cancelling() > before:
+                raise asyncio.CancelledError
 
     async def listen_to(self, topic: str, qos: int = 1, *, as_published: bool = True) -> bool:
         """Subscribe; return whether the broker allows it. One that takes no wildcards is not asked

@@ -63,6 +63,7 @@ from skin_host.mqtt.topics import OFFLINE, ONLINE, PartTopic, Topics
 from skin_host.mqtt.trials import TRIES, Trials
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
+from skin_host.tasks import leave_if_cancelled
 
 FRAME_EXPIRY_S = 1
 #: A request of 64 KiB, with its topic and properties.
@@ -356,6 +357,7 @@ class Publisher:
                 why = self._note_loss(error, said, was_connected=since_s is not None)
             finally:
                 self._forget_connection()
+            leave_if_cancelled()
             if why is None or (self._closing.is_set() and not self._outbox.events):
                 return
             up_s = 0.0 if since_s is None else clock.monotonic_s() - since_s

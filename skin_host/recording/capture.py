@@ -40,7 +40,7 @@ from skin_host.mqtt.connection import Retry, connect, explain, first_error
 from skin_host.mqtt.payload import MAX_PACKET_BYTES
 from skin_host.recording import MCAP_SUFFIX
 from skin_host.recording.mcap import Recorder, recorded_topics
-from skin_host.tasks import until
+from skin_host.tasks import leave_if_cancelled, until
 
 #: Takes a batch of a channel.
 CanSink = Callable[[str, FrameBatch], None]
@@ -358,6 +358,7 @@ async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None
             recorder.gaps += not is_out  # however many attempts it takes to listen again
             is_out = True
             _log.warning("broker %s: %s; trying again", broker, explain(first_error(group)))
+        leave_if_cancelled()
         await asyncio.sleep(retry.delay_s(0.0 if since_s is None else time.monotonic() - since_s))
 
 

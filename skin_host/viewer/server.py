@@ -30,7 +30,7 @@ from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import first_error
 from skin_host.recording.capture import MAX_AGO_S, PageRecording
-from skin_host.tasks import cancel
+from skin_host.tasks import cancel, leave_if_cancelled
 from skin_host.untrusted import from_json, names_us
 from skin_host.viewer.picture import Cursor, Picture
 
@@ -301,6 +301,7 @@ class Viewer:
                 await cancel(waiting)
             self._picture.lose()
             self._take_status(connected=False)
+            leave_if_cancelled()
             await asyncio.sleep(RETRY_S)
 
     async def _await(self, client: SkinClient) -> None:

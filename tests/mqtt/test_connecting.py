@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.connection import MqttError, connect, explain
+from skin_host.mqtt.connection import Connection, MqttError, connect, explain
 from tests.support.packets import CONNACK, SUBSCRIBE, packet
 from tests.support.waiting import PATIENCE_S, until
 
@@ -77,3 +77,28 @@ async def test_a_subscription_over_which_the_connection_ends_fails_for_the_reaso
     server.close()
     assert reason in explain(subscribing.value)
     assert "the broker closed the connection" in explain(sending.value)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+async def test_a_wait_that_ends_as_its_task_is_cancelled_is_cancelled(fails: bool) -> None:
+    """Otherwise the task goes on, and who cancelled it waits for ever."""
+    broker, _ = Broker.from_url("mqtt://127.0.0.1")
+    connection = Connection(
+        broker,
+        identifier=None,
+        will=None,
+        max_incoming=1,
+        max_packet=100,
+        session_s=0,
+        resume=False,
+    )
+    answer: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+    waiting = asyncio.create_task(connection._wait_for(answer, PATIENCE_S))
+    await asyncio.sleep(0)
+    if fails:
+        answer.set_exception(MqttError("closed"))
+    else:
+        answer.set_result(None)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
