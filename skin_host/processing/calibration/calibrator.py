@@ -228,7 +228,8 @@ class Calibrator:
             # Neighbouring blocks do not show noise that wanders for seconds, or seldom jumps.
             expected = before.noise * np.sqrt(repeats / course.length)
             error = np.where(before.usable, np.fmax(error, expected), error)
-        touched = self._touched(variance, repeats, error) | self._pressed_together()
+        shown = self._touched(variance, repeats, error)
+        touched = shown | self._pressed_together(shown)
         steady_noise = steady * np.sqrt(course.length * samples / np.maximum(received, 1))
         # The lowest activation is the untouched one. The lowest mean alone would be too low by what
         # noise took it down: the fewer measurements a mean has, the more.
@@ -427,16 +428,21 @@ class Calibrator:
                 pressed[taxel] |= shared > SHARED_CORRELATION
         return pressed
 
-    def _pressed_together(self) -> Mask:
+    def _pressed_together(self, shown: Mask) -> Mask:
         """Return the taxels [n] of parts that were pressed as a whole for a part of the time.
 
         The noise of each may hide a slow press, as of air in a chamber, that together they show.
+
+        Args:
+            shown: bool[n], taxels that show it by themselves. How they move is no evidence about
+                the others, which may be beside what pressed these.
         """
         course, layout = self._course, self._layout
         found = np.zeros(len(self._received), np.bool_)
         pressure = np.flatnonzero(layout.pad_kind == PadKind.PRESSURE)
         for part, passed_s in zip(layout.parts, self._passed_s, strict=True):
             pads = pressure[(pressure >= part.start) & (pressure < part.stop)]
+            pads = pads[~shown[pads]]
             number = int(course.number[pads].max(initial=0)) // JOINED * JOINED
             pads = pads[course.number[pads] >= number]
             if number < FEWEST_BLOCKS * JOINED:

@@ -575,6 +575,18 @@ def test_a_slow_press_of_a_whole_part_is_a_touch_though_noise_hides_it_on_each_p
     assert touched[:20].mean() < 0.2
 
 
+def test_pads_beside_a_press_that_ends_during_a_calibration_were_not_touched():
+    """The pressed ones move the mean of the part, which the noise of some follows by chance."""
+    pressed = np.arange(N) < N // 2
+    for seed in range(10):
+        raw = noisy(np.random.default_rng(seed), sweeps=100, sd=0.8)
+        raw[80:] += 8.0 * pressed
+        touched = calibrated(np.minimum(raw, 255)).verdict == Verdict.TOUCHED
+        pressure = LAYOUT.pad_kind == PadKind.PRESSURE
+        assert touched[pressed & pressure].all()
+        assert not touched[~pressed].any()
+
+
 @pytest.mark.parametrize("sd", [0.4, 1.2, 3.0])
 def test_what_drifts_less_than_a_touch_while_it_is_calibrated_is_no_touch(sd):
     for seed in range(5):
