@@ -520,7 +520,8 @@ class Draft:
     temporary files: it can be written in any order, and nobody reads half of it.
 
     Args:
-        wanted: the name; missing parent folders are made.
+        wanted: the name; missing parent folders are made, and removed with a draft that is not
+            completed.
         new: a file that has this name by then is not replaced.
 
     Attributes:
@@ -532,10 +533,13 @@ class Draft:
 
     def __init__(self, wanted: Path, *, new: bool = False) -> None:
         self._wanted, self._new = wanted, new
+        #: Folders that were made for it, the deepest first.
+        self._folders: list[Path] = []
         with _naming(wanted):
             self._end = _end_of(wanted)
             self._file = _file_at(self._end)
             if self._file is not None:
+                self._folders = [one for one in self._file.parents if not os.path.lexists(one)]
                 self._file.parent.mkdir(parents=True, exist_ok=True)
                 self.path = _growing(self._file.with_name(wanted.name))
             else:
@@ -602,8 +606,11 @@ class Draft:
             raise OSError(error.errno, f"{error.strerror}; a part of it is {self.path}") from None
 
     def remove(self) -> None:
-        """Remove it, if it is still in progress."""
+        """Remove it, if it is still in progress, and the folders that were made for it alone."""
         self.path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # something else lies there
+            for folder in self._folders:
+                folder.rmdir()
 
 
 @contextlib.contextmanager
@@ -661,8 +668,11 @@ def check_output(output: Path, *, folder: bool = False) -> None:
             raise RequestError(f"{output}: is a file; wanted a folder")
         if not place.is_dir():
             raise OSError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(place))
-        if not os.access(place, os.W_OK | os.X_OK):
-            raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(place))
+        import tempfile  # which imports every way of compression
+
+        # Permissions do not show what a file system such as /proc takes.
+        with tempfile.TemporaryFile(dir=place):
+            pass
 
 
 def write_together(
@@ -695,6 +705,6 @@ def write_together(
             with writing(path):
                 draft.finish()
     finally:
-        for draft in drafts.values():
+        for draft in reversed(drafts.values()):  # the first may have made the folder of all
             draft.remove()
     return list(drafts)

@@ -9,7 +9,7 @@ from typing import Any
 
 from skin_host.errors import RequestError, SkinError
 from skin_host.mqtt.commands import Result, encode_request
-from skin_host.mqtt.topics import NAME
+from skin_host.mqtt.topics import NAME, WRONG_NAME
 
 #: A node answers a command within this time, and that for which the command lasts.
 ANSWER_S = 10.0
@@ -102,9 +102,7 @@ def refuse_wrong_name(name: str) -> None:
         RequestError: it is such a name.
     """
     if not NAME.fullmatch(name):
-        raise RequestError(
-            "a command and a node have names of up to 64 of the characters a-z 0-9 _ -"
-        )
+        raise RequestError(WRONG_NAME)
 
 
 def answer_within_s(arguments: Mapping[str, Any]) -> float:

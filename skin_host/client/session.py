@@ -39,7 +39,7 @@ from skin_host.mqtt.info import NodeInfo
 from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.order import parts_of, run_of, stamp_of
 from skin_host.mqtt.payload import JSON_TYPE, MessageError
-from skin_host.mqtt.topics import PartTopic, Topics, wrong_part
+from skin_host.mqtt.topics import NAME, WRONG_NAME, PartTopic, Topics, wrong_part
 from skin_host.processing.events import Touch
 from skin_host.tasks import cancel
 
@@ -638,10 +638,12 @@ class SkinClient:
         """Remember a name, so that what is known of names stays bounded: anybody may publish.
 
         Raises:
-            MessageError: there are too many.
+            MessageError: no configuration has such a name, or there are too many.
         """
         names = self._names[is_node]
         if name not in names:
+            if not NAME.fullmatch(name):
+                raise MessageError(WRONG_NAME)
             if len(names) >= MAX_NAMES:
                 what = "nodes" if is_node else "parts"
                 raise MessageError(f"more than {MAX_NAMES} {what} of one robot")

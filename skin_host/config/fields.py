@@ -22,13 +22,19 @@ Name = Annotated[
     str,
     Meta(pattern=_text(r"^[a-z0-9_-]+(?!\n)$", "the characters a-z, 0-9, - and _"), max_length=64),
 ]
-#: Free text: without what steers a terminal, and without the zero byte, which the system refuses.
+#: What steers a terminal, and the zero byte, which the system refuses.
+_UNPRINTABLE = "\\x00-\\x1f\\x7f-\\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
+#: Free text.
 Printable = Annotated[
+    str, Meta(pattern=_text(f"^[^{_UNPRINTABLE}]*$", "characters that can be printed"))
+]
+#: One computer: no URL and no port. An IPv6 address has two colons or more.
+Host = Annotated[
     str,
     Meta(
         pattern=_text(
-            "^[^\\x00-\\x1f\\x7f-\\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]*$",
-            "characters that can be printed",
+            f"^([^:/{_UNPRINTABLE}]+|([^:/{_UNPRINTABLE}]*:){{2}}[^/{_UNPRINTABLE}]*)(?!\n)$",
+            "a host alone; its port is the key `port`",
         )
     ),
 ]

@@ -32,6 +32,7 @@ from skin_host.config.fields import (
     Coefficient,
     FileName,
     Hertz,
+    Host,
     Millimetres,
     Name,
     PlaceMm,
@@ -226,7 +227,7 @@ class Processing(_Table, frozen=True):
 class Mqtt(_Table, frozen=True):
     """The broker. The password is never stored here: it is read from a file or credential."""
 
-    host: Printable = "localhost"
+    host: Host = "localhost"
     port: Annotated[int, Meta(ge=1, le=LAST_PORT)] = 1883
     #: Instead of `host`: nodes of a cluster or independent brokers, as "host" or "host:port".
     brokers: Annotated[list[Address], Meta(max_length=16)] = []

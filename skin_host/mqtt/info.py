@@ -18,6 +18,7 @@ import msgspec
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
+from skin_host.config.fields import Name
 from skin_host.mqtt.messages import SCALE_KPA
 from skin_host.mqtt.payload import MessageError, decode
 from skin_host.mqtt.topics import Topics
@@ -65,7 +66,7 @@ class TriangleInfo(Struct, frozen=True):
     `no_load` is the byte of an untouched taxel, as configured; None from older nodes.
     """
 
-    board: str
+    board: Name
     number: int
     kind: str
     first: int
@@ -141,8 +142,8 @@ class NodeInfo(Struct, frozen=True, kw_only=True):
     calibration: CalibrationInfo | None = None
     commands: bool = True
     pieces: Annotated[int, Meta(ge=1, le=MAX_PIECES)] = 1
-    parts: Annotated[dict[str, PartInfo], Meta(max_length=10_000)]
-    fingertips: Annotated[dict[str, FingertipInfo], Meta(max_length=10_000)] = {}
+    parts: Annotated[dict[Name, PartInfo], Meta(max_length=10_000)]
+    fingertips: Annotated[dict[Name, FingertipInfo], Meta(max_length=10_000)] = {}
 
 
 _decoder = msgspec.json.Decoder(NodeInfo)

@@ -24,6 +24,9 @@ MAX_BASE_LEVELS = 32
 MAX_PART = 64
 #: Names of parts and nodes, as a configuration gives them.
 NAME = re.compile(rf"[a-z0-9_-]{{1,{MAX_PART}}}")
+WRONG_NAME = (
+    f"parts, nodes and commands have names of up to {MAX_PART} of the characters a-z 0-9 _ -"
+)
 
 ONLINE = b"online"
 OFFLINE = b"offline"

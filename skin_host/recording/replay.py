@@ -275,27 +275,32 @@ def calibrate_from_log(
             "made with this CONFIG, see `skin check CONFIG`"
         )
     if not engine.calibration_progress() and (slow := _slow_boards(engine)):
-        raise LogError(
-            f"{log}: {slow}: so slow that each sweep comes after a silence, and nothing of it "
-            "counts; wanted boards.NAME.period_ms as in the recording"
-        )
+        raise LogError(f"{log}: {slow}")
     # A recording's calibration carries the recording's time, so that replays stay equal.
     time = datetime.fromtimestamp(last_ns / 1e9, UTC).isoformat(timespec="seconds")
     return engine.end_calibration(time)
 
 
 def _slow_boards(engine: Engine) -> str:
-    """Return in words which boards regularly send in longer periods than configured."""
+    """Return in words which boards regularly send so slowly that each sweep ends a silence; empty:
+    none.
+    """
     found = []
     for board in engine.boards:
-        seen_ns = engine.ledger.regular_period_ns(engine.ledger.row[board]) or 0.0
+        row = engine.ledger.row[board]
+        seen_ns = engine.ledger.regular_period_ns(row) or 0.0
         own = engine.layout.boards[board]
-        if seen_ns > own.settings.period_ms * 1e6:
+        if seen_ns > engine.ledger.silent_after_ns[row]:
             found.append(
                 f"{own.name} sends every {seen_ns / 1e6:.0f} ms (configured: "
                 f"{own.settings.period_ms:g} ms)"
             )
-    return ", ".join(found)
+    if not found:
+        return ""
+    return (
+        f"{', '.join(found)}: so slow that each sweep comes after a silence, and little or nothing "
+        "of it counts; wanted boards.NAME.period_ms as in the recording"
+    )
 
 
 def doubts(calibration: Calibration, settings: Settings, layout: Layout) -> list[str]:
@@ -470,7 +475,8 @@ def process(
 ) -> int:
     """Do one task; return the number of frames of pressure.
 
-    `warn` is called with each of the `doubts` before anything is written.
+    `warn` is called with each of the `doubts` before anything is written, and afterwards with the
+    boards of which little or nothing counted because they send much more slowly than configured.
 
     Raises:
         LogError, CalibrationError, ConfigurationError: a file is wrong.
@@ -483,9 +489,13 @@ def process(
         warn(doubt)
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
     if task.output is None:
-        return write_lines(task.log, engine, sys.stdout.buffer, progress)
-    with whole_file(task.output) as growing, growing.open("wb") as output:
-        return write_lines(task.log, engine, output, progress)
+        number = write_lines(task.log, engine, sys.stdout.buffer, progress)
+    else:
+        with whole_file(task.output) as growing, growing.open("wb") as output:
+            number = write_lines(task.log, engine, output, progress)
+    if slow := _slow_boards(engine):
+        warn(slow)
+    return number
 
 
 def process_all(

@@ -1,5 +1,6 @@
 """What cannot be written at the end is refused before the work, which may take minutes."""
 
+import errno
 import sys
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import pytest
 
 from skin_host.cli import main
 from skin_host.errors import RequestError, SkinError
-from skin_host.files import check_output
+from skin_host.files import Draft, check_output, write_together
 
 ROOT = Path(__file__).parents[2]
 DEMO = str(ROOT / "config/demo.toml")
@@ -108,13 +109,31 @@ def test_what_can_be_written_is_not_touched_by_the_check(tmp_path: Path) -> None
     assert (tmp_path / "file").read_text() == "kept"
 
 
-def test_a_place_where_nothing_can_be_written_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("place", ["/proc", "/proc/new", "/sys"])
+@pytest.mark.parametrize("folder", [False, True])
+def test_a_place_where_nothing_can_be_written_is_refused(place: str, folder: bool) -> None:
+    """Whoever is root may write there by its permissions."""
+    output = Path(place) if folder else Path(place, "new")
+    with pytest.raises(SkinError, match=f"^{output}: cannot be written: ") as refused:
+        check_output(output, folder=folder)
+    assert not isinstance(refused.value, RequestError)
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_files_that_cannot_be_written_leave_no_folder(
+    there: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "folder").mkdir()
-    monkeypatch.setattr("os.access", lambda path, _: Path(path) != tmp_path)
-    for folder in (False, True):
-        with pytest.raises(SkinError, match="new: cannot be written: Permission denied") as refused:
-            check_output(tmp_path / "new", folder=folder)
-        assert not isinstance(refused.value, RequestError)
-        check_output(tmp_path / "folder" / "new", folder=folder)
+    (tmp_path / "there").mkdir()
+    folder = tmp_path / "there" if there else tmp_path / "a" / "b"
+    tables = [(folder / f"{name}.csv", b"") for name in ("hand", "arm", "touches")]
+    write_together(tables[:1] if there else [])
+
+    def fill(draft: Draft) -> None:
+        if "touches" in draft.path.name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Draft, "sync", fill)
+    with pytest.raises(SkinError, match=r"touches.csv: cannot be written: No space left"):
+        write_together(tables)
+    left = [path.name for path in sorted(tmp_path.rglob("*"))]
+    assert left == ["there", *(["hand.csv"] if there else [])]

@@ -559,6 +559,24 @@ async def test_nonsense_on_a_topic_is_counted_and_passed_over(mosquitto: Mosquit
         assert skin.unreadable == 2  # the third was for somebody else
 
 
+async def test_names_that_no_configuration_has_are_passed_over(
+    mosquitto: Mosquitto, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = ("N" * 60_000, "<script>", "\u202emlap", "Palm")
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        contacts = skin.contacts()
+        await skin.ready()
+        async with aiomqtt.Client(mosquitto.host, mosquitto.port) as somebody:
+            for name in names:
+                await somebody.publish(f"skin/robot/{name}/contact", b"ON", qos=1)
+                await somebody.publish(f"skin/robot/nodes/{name}/status", b"online", qos=1)
+        await until(lambda: skin.unreadable == 2 * len(names))
+        publisher.put_contact("palm", "ON")
+        assert (await take(contacts, 1))[0].part == "palm"
+        assert set(skin.nodes) == {"main"}
+    assert len([line for line in caplog.messages if "passed over" in line]) == 1
+
+
 async def test_what_cannot_be_read_steers_no_terminal(
     mosquitto: Mosquitto, caplog: pytest.LogCaptureFixture
 ) -> None:

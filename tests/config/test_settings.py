@@ -362,7 +362,6 @@ def flat(hint: Any) -> Iterator[Any]:
         ("buses.can0.options", "a\0"),
         ("kinds.row.about", "a\u202eb"),
         ("processing.relaxation.file", "r\0.json"),
-        ("mqtt.host", "a\x1b[31m"),
         ("mqtt.username", "a\rb"),
         ("mqtt.ca_file", "a\nb"),
         ("service.state_directory", "a\x9bb"),
@@ -377,6 +376,23 @@ def test_text_that_cannot_be_printed_is_refused(
     assert line.isprintable()
     assert f" {key}: seen " in line or f" {key}[...]: seen " in line
     assert "of characters that can be printed" in line
+
+
+@pytest.mark.parametrize(
+    "host", ["localhost:1884", "10.0.0.5:1884", "mqtt://localhost", "", "a\x1b[31m", "a\n"]
+)
+def test_a_broker_that_is_no_host_alone_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], host: str
+) -> None:
+    assert main(["check", str(written(tmp_path, "mqtt.host", host))]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "mqtt.host: seen " in line
+    assert "of a host alone; its port is the key `port`" in line
+
+
+@pytest.mark.parametrize("host", ["localhost", "10.0.0.5", "fe80::1%eth0", "::1", "bücher.local"])
+def test_a_host_may_be_a_name_or_an_address(tmp_path: Path, host: str) -> None:
+    assert load(written(tmp_path, "mqtt.host", host)).mqtt.host == host
 
 
 @pytest.mark.parametrize(

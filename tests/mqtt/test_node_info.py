@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from skin_host.config.settings import changed, load, skin_hash
 from skin_host.layout import build_layout
@@ -71,3 +72,13 @@ def test_lists_of_different_lengths_are_refused() -> None:
     payload = encode_info(node_info(layout, "main", version="1", configuration="x"))
     with pytest.raises(MessageError, match="differ in length"):
         decode_info(payload.replace(b'"pads":["pressure",', b'"pads":[', 1))
+
+
+@pytest.mark.parametrize("name", ["N" * 65_000, "a" * 65, "<script>", "\u202eh", "a\n", "a/b", ""])
+def test_a_part_of_a_name_that_no_configuration_has_is_refused(name: str) -> None:
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    info = node_info(layout, "main", version="1", configuration="x")
+    parts = {name: info.parts["left_hand"]}
+    with pytest.raises(MessageError, match="info: "):
+        decode_info(encode_info(replace(info, parts=parts)))
+    assert decode_info(encode_info(info)) == info

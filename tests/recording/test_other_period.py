@@ -1,5 +1,6 @@
-"""A recording of boards that send much more slowly than configured is refused by that name."""
+"""Of boards that send much more slowly than configured a recording shows that, not silence."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -25,3 +26,20 @@ def test_boards_that_send_much_more_slowly_than_configured_are_named(
     assert not output.exists()
     assert calibrate(bench, log, table) != 0
     assert f"a sends every 200 ms (configured: {period_ms} ms)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("period_ms", "is_slow"), [(40, True), (60, False)])
+def test_a_recording_of_which_little_counts_for_that_is_processed_with_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], period_ms: int, is_slow: bool
+) -> None:
+    bench = write_config(tmp_path)
+    bench.write_text(bench.read_text().replace("period_ms = 200", f"period_ms = {period_ms}"))
+    log = write_log(tmp_path / "slow.log", ramp(bench)[0])
+    output = tmp_path / "slow.jsonl"
+    words = "replay", log, "--config", bench, "--output", output
+    assert main([str(word) for word in words]) == 0
+    error = capsys.readouterr().err
+    assert ("a sends every 200 ms (configured: 40 ms), b sends every 200 ms" in error) == is_slow
+    assert ("wanted boards.NAME.period_ms as in the recording" in error) == is_slow
+    last_frame = [line for line in output.read_text().splitlines() if '"frame"' in line][-1]
+    assert any(json.loads(last_frame)["valid"]) != is_slow

@@ -163,10 +163,12 @@ export class SkinMap {
   arrange() {
     const ctx = this.canvas.getContext("2d");
     ctx.font = FONT;
+    // A name that is wider than the map is squeezed: it must not make all skin small.
+    const widest = this.canvas.clientWidth || 1;
     const boxes = this.parts.map((part) => {
       const [x0, y0, x1, y1] = this.poses.get(part.name)?.box ?? [0, 0, 1, 1];
       const w = x1 - x0 + GAP_MM;
-      return { part, w, own: w, h: y1 - y0 + GAP_MM, x0, y0, label: ctx.measureText(part.name).width + 16 };
+      return { part, w, own: w, h: y1 - y0 + GAP_MM, x0, y0, label: Math.min(widest, ctx.measureText(part.name).width + 16) };
     });
     this.placed = [];
     if (!boxes.length) return;
@@ -366,7 +368,7 @@ export class SkinMap {
     const age = part.heardMs === null ? "no data" : `stale, ${((nowMs - part.heardMs) / 1000).toFixed(0)} s`;
     const words = stale ? `${part.name}: ${age}` : part.hasFrames ? part.name : `${part.name}: touches only`;
     // What does not fit without touching the next label is told by its colour, and beside Health.
-    ctx.fillText(ctx.measureText(words).width + 8 < room * scale ? words : part.name, lx, ly);
+    ctx.fillText(ctx.measureText(words).width + 8 < room * scale ? words : part.name, lx, ly, this.canvas.clientWidth);
   }
 
   drawTaxels(ctx, look, part, pose, dx, dy, scale, blank) {

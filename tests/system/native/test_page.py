@@ -701,6 +701,18 @@ async def test_a_phone_shows_everything_without_scrolling_sideways(
         assert await seen.run(DRAWN) > 8_000
 
 
+async def test_a_name_that_is_wider_than_the_map_makes_no_skin_small(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    async with viewing(mosquitto, "nobody", tmp_path / "p", 400, watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.length > 0")
+        assert await seen.run(MANY_PARTS)
+        drawn = await seen.run(DRAWN)
+        name = "`right_upper_part_${k}`"
+        assert await seen.run(MANY_PARTS.replace(name, f"k ? {name} : 'w'.repeat(64)"))
+        assert await seen.run(DRAWN) > 0.8 * drawn
+
+
 @pytest.mark.parametrize("width", [1280, 400])
 async def test_a_whole_robot_is_one_line_that_opens_and_its_labels_keep_apart(
     mosquitto: Mosquitto, tmp_path: Path, width: int
