@@ -201,7 +201,12 @@ class Accusations:
             longest_ns = WRONG_NS
         return any(
             trouble.accuses(code, where)
-            and (over is None or now_ns - over < longest_ns or trouble.lingers or code in LASTING)
+            and (
+                over is None
+                or now_ns - over < longest_ns
+                or trouble.lingers
+                or code in LASTING | trouble.lasting
+            )
             for trouble, _, over in self.troubles
         )
 

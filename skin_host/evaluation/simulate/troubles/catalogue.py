@@ -45,6 +45,9 @@ _UNANSWERED = _LINE | {"triangle_silenced"}
 _WRONG_BITS = _LINE | {"board_rezeroed", "bus_bit_errors", "taxel_out_of_range"}
 _SILENCED = {"triangle_silenced", "triangle_answers_again"}
 _WRONG_BITS |= {"triangle_out_of_range", *_SILENCED}
+#: A board that zeroes itself meanwhile takes a wrong bit into a pad's zero. If it is the highest,
+#: the pad's bytes jump from one end of the scale to the other until the board is zeroed again.
+_WRONG_ZERO = frozenset({"taxel_noisy"})
 _ELSEWHERE = {"triangle_not_connected", "triangle_out_of_range", "taxel_out_of_range"}
 KINDS: dict[str, Begin] = {
     "chip_gone": emulated("chip_gone", CHIPS | SET_UP, {"triangle_not_connected"}, 1.0),
@@ -76,9 +79,21 @@ KINDS: dict[str, Begin] = {
     "clock_stretched": emulated("clock_stretched", SWAPPED, _ELSEWHERE | _LINE, 1.0, spoils=True),
     # What a wrong bit does to a reading, or to the board that takes it for a missing chip.
     "bit_flipped": emulated(
-        "bit_flipped", SWAPPED | {"bus_bit_errors"}, _WRONG_BITS, 4.0, spoils=True
+        "bit_flipped",
+        SWAPPED | {"bus_bit_errors"},
+        _WRONG_BITS,
+        4.0,
+        spoils=True,
+        lasting=_WRONG_ZERO,
     ),
-    "slow_rise": emulated("slow_rise", SWAPPED | {"bus_bit_errors"}, _WRONG_BITS, 4.0, spoils=True),
+    "slow_rise": emulated(
+        "slow_rise",
+        SWAPPED | {"bus_bit_errors"},
+        _WRONG_BITS,
+        4.0,
+        spoils=True,
+        lasting=_WRONG_ZERO,
+    ),
     "brown_out": emulated(
         "brown_out",
         SWAPPED,

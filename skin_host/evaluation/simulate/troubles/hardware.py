@@ -73,12 +73,13 @@ def emulated(
     sure: float = 0.0,
     lingers: bool = False,
     lasts_s: tuple[float, float] = (0.2, 15.0),
+    lasting: frozenset[str] = frozenset(),
 ) -> Begin:
     """A fault of the emulator's catalogue, with targets and value drawn.
 
     Args:
         name: of it.
-        may, must, within_s, spoils, recovers_s, lingers, lasts_s: see `Trouble`.
+        may, must, within_s, spoils, recovers_s, lingers, lasts_s, lasting: see `Trouble`.
         values: least and most of its value.
         sure: from this value on, it must be reported.
     """
@@ -180,6 +181,7 @@ def emulated(
             lingers,
             shows=shows,
             lasts_s=lasts_s,
+            lasting=lasting,
         )
 
     return begin

@@ -47,6 +47,7 @@ class Trouble:
         lasts_s: shortest and longest; no time at all for what happens at once.
         twice: the board at whose address a second one sends; once health has reported that, no
             taxel of it is valid.
+        lasting: codes of `may` of what lasts, though it is over, until the boards are zeroed again.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Trouble:
     shows: Callable[[], bool] = always
     lasts_s: tuple[float, float] = (0.2, 15.0)
     twice: str = ""
+    lasting: frozenset[str] = frozenset()
 
     def accuses(self, code: str, where: str) -> bool:
         """Whether health may report this because of it."""
