@@ -1,4 +1,4 @@
-"""Discovers, sets up, starts, supervises and stops the boards of one bus; `scan` only lists them.
+"""Discovers, sets up, starts, supervises and stops the boards of one bus.
 
 A board that times out is queried for its type and its uptime: at once, then at growing intervals.
 If it was reset, it is set up again; if it was not, it is commanded to start, which does not change
@@ -35,7 +35,6 @@ from skin_host.bus.answers import (
 )
 from skin_host.bus.board import GAP_S, BoardRecord, configuration
 from skin_host.bus.commands import (
-    BoardType,
     Discover,
     GetTimeOfLife,
     Message,
@@ -44,10 +43,8 @@ from skin_host.bus.commands import (
     command_frame,
 )
 from skin_host.bus.ledger import BoardLedger
-from skin_host.bus.opening import open_port
-from skin_host.bus.wire import BROADCAST_ADDRESS, find_skin_frames
+from skin_host.bus.wire import BROADCAST_ADDRESS
 from skin_host.clock import SYSTEM, Clock
-from skin_host.config.settings import Bus, Receive, format_triangles
 from skin_host.errors import BusError
 from skin_host.layout import BoardLayout, TriangleLayout
 from skin_host.tasks import cancel
@@ -80,8 +77,6 @@ UNANSWERED = 2
 #: A board that sends for so long after it answered that it is in its bootloader, or reads no skin,
 #: did not send that answer, or is another one by now.
 CLAIM_S = 5.0
-#: A scan listens for so long before it asks, and again after.
-SCAN_S = 0.5
 
 
 class Sender(Protocol):
@@ -567,86 +562,3 @@ class Boards:
         if record.warned_at_ns is None or now_ns - record.warned_at_ns > WARN_S * 1e9:
             record.warned_at_ns = now_ns
             log.warning("bus %s: board %s %s", self.bus, record.layout.name, what)
-
-
-@dataclass(slots=True)
-class FoundBoard:
-    """A board that answered or streams."""
-
-    address: int
-    board_type: str
-    firmware: str | None
-    in_bootloader: bool
-    triangles: list[int]
-
-
-async def scan(bus: Bus) -> list[FoundBoard]:
-    """Broadcast a discovery and listen for answers and streams.
-
-    Raises:
-        BusError: the interface cannot be opened or does not take frames.
-    """
-    port = open_port("scan", bus, Receive())
-    found: dict[int, FoundBoard] = {}
-    #: Of each board, which halves of which triangles came: a lone one may be no frame of skin.
-    halves: dict[int, set[tuple[int, int]]] = {}
-    try:
-        # Listen before asking: an MTB3 that streams stops sending when it is asked.
-        for asked in (False, True):
-            if asked:
-                await port.send([command_frame(Discover(), BROADCAST_ADDRESS)])
-            for _ in range(10):
-                await asyncio.sleep(SCAN_S / 10)
-                batch = port.read()
-                skin = find_skin_frames(batch)
-                for board, triangle, half in zip(
-                    skin.board.tolist(), skin.triangle.tolist(), skin.half.tolist(), strict=True
-                ):
-                    halves.setdefault(board, set()).add((triangle, half))
-                for row in range(len(batch)):
-                    payload = batch.data[row, : int(batch.dlc[row])].tobytes()
-                    parsed = parse_answer(int(batch.id[row]), payload)
-                    if parsed is None:
-                        continue
-                    address, answer = parsed
-                    if isinstance(answer, Discovered):
-                        version = (
-                            f"{answer.firmware_major}.{answer.firmware_minor}."
-                            f"{answer.firmware_build}"
-                        )
-                        found[address] = FoundBoard(
-                            address, _type_name(answer.board_type), version, False, []
-                        )
-                    elif isinstance(answer, DiscoveredBootloader):
-                        found[address] = FoundBoard(
-                            address, _type_name(answer.board_type), None, True, []
-                        )
-    finally:
-        port.close()
-    for address, seen in halves.items():
-        triangles = sorted(triangle for triangle, half in seen if half and (triangle, 0) in seen)
-        if triangles:
-            record = found.setdefault(address, FoundBoard(address, "unknown", None, False, []))
-            record.triangles = triangles
-    return [found[address] for address in sorted(found)]
-
-
-def scan_table(found: list[FoundBoard], channel: str) -> str:
-    if not found:
-        return (
-            f"{channel}: nobody answered. Are the boards powered, is the bitrate 1 Mbit/s, is the "
-            "bus terminated?"
-        )
-    lines = ["address  type      firmware  streaming triangles"]
-    for one in found:
-        firmware = "bootloader" if one.in_bootloader else one.firmware or "-"
-        streaming = format_triangles(one.triangles) or "-"
-        lines.append(f"{one.address:>7}  {one.board_type:<8}  {firmware:<8}  {streaming}")
-    return "\n".join(lines)
-
-
-def _type_name(number: int) -> str:
-    try:
-        return BoardType(number).name.lower()
-    except ValueError:
-        return f"type {number}"

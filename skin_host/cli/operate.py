@@ -293,7 +293,7 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings", layout: "L
 def _scan(arguments: argparse.Namespace) -> int:
     import asyncio
 
-    from skin_host.bus.boards import scan, scan_table
+    from skin_host.bus.scan import scan, scan_table
     from skin_host.config.settings import Bus
 
     bus = Bus(interface=arguments.interface, channel=arguments.channel)

@@ -7,8 +7,8 @@ import can
 import numpy as np
 
 from skin_host.bus.answers import Discovered, DiscoveredBootloader, answer_frame
-from skin_host.bus.boards import scan, scan_table
 from skin_host.bus.commands import BoardType, Discover, command_frame
+from skin_host.bus.scan import scan, scan_table
 from skin_host.bus.wire import BROADCAST_ADDRESS, encode_sweep
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
