@@ -22,6 +22,9 @@ that was taken under the press would make them read none. So the board counts ag
 either shows it, and goes on being compared. What still presses after a silence in which no touch
 would have ended was there all the time, whatever the others show: beside it pads are pressed too
 lightly for a touch, and had moved as those of a new zero do.
+
+Where most pads read more than a new zero and any drift leave, neither explains the readings:
+something presses on them. Then which of two improbable ones is less so shows nothing.
 """
 
 import math
@@ -206,7 +209,16 @@ class SilentZero:
     @property
     def was_zeroed(self) -> bool:
         """Return whether what came so far shows that the board was zeroed."""
-        return not self._outlasted and self.evidence() > math.log(ODDS)
+        zeroed = not self._outlasted and self.evidence() > math.log(ODDS)
+        return zeroed and not self._most_are_pressed()
+
+    def _most_are_pressed(self) -> bool:
+        """Return whether most pads, touched before or not, read more than all may drift by."""
+        seen = (self._known | self.touched) & (self._count >= FEWEST)
+        most_units = COMMON_SIGMAS * math.hypot(COMMON_UNITS, max(self._drifted_units))
+        return bool(
+            2 * np.count_nonzero(self._sum[seen] > most_units * self._count[seen]) > seen.sum()
+        )
 
     def evidence(self, fewest: int = FEWEST) -> float:
         """Return how much more probable the readings are after a zero, as a natural logarithm.

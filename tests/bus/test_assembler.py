@@ -413,6 +413,27 @@ def test_the_end_of_a_sweep_of_known_order_may_come_in_time_and_not_later(first:
         assert [sweep.present for sweep in sweeps + assembler.flush()] == present
 
 
+def test_an_early_sweep_is_whole_though_its_first_frame_was_lost_from_the_one_before() -> None:
+    assembler = make()
+    feed(assembler, frames(values(4, 1), PERIOD))
+    feed(assembler, frames(values(4, 2), 2 * PERIOD)[1:])
+    early = values(4, 3)
+    *_, whole = feed(assembler, frames(early, 2 * PERIOD + 30 * MS))
+    np.testing.assert_array_equal(whole.raw[:4], early)
+    assert assembler.counters.late == 0
+
+
+def test_a_sweep_that_two_reads_divide_loses_no_triangle() -> None:
+    """An adapter without time stamps, read every 30 ms: its end seems to come too late."""
+    assembler = make()
+    feed(assembler, frames(values(4, 1), PERIOD))
+    sent = frames(values(4, 2), 2 * PERIOD, spacing_ns=0)
+    sent[4:] = [(*one[:2], one[2] + 30 * MS) for one in sent[4:]]
+    sweeps = feed(assembler, sent) + assembler.expire(4 * PERIOD)
+    assert [sweep.present for sweep in sweeps] == [0b0011, 0b1100]
+    assert assembler.counters.late == 0
+
+
 def identifier(message_class: wire.MessageClass, address: int, triangle: int = 0) -> int:
     return message_class << 8 | address << 4 | triangle
 

@@ -43,7 +43,7 @@ class Skin:
         common_units: float = 0.0,
         own_units: float = 0.0,
         pressed: slice = slice(0),
-        press_units: float = 20.0,
+        press_units: float | NDArray[np.float64] = 20.0,
         silent_s: float = 3.0,
     ) -> tuple[bool | None, float]:
         """Return what is decided, and the evidence, after a silence in which all pads drifted by
@@ -163,6 +163,19 @@ def test_one_firm_press_where_a_zero_would_be_is_no_zero() -> None:
     skin.baseline[0] = -3.0
     found, _ = skin.evidence(False, pressed=slice(0, 1), press_units=3.0)
     assert found is False
+
+
+@pytest.mark.parametrize("silent_s", [0.2, 1.0, 30.0])
+def test_a_load_on_all_pads_that_begins_in_a_silence_is_no_zero(silent_s: float) -> None:
+    """Pads differ in what the same load makes them read: neither a zero nor none explains it."""
+    everything = slice(0, N)
+    for seed in range(50):
+        skin = Skin(seed)
+        press_units = 10.0 * skin.rng.uniform(0.6, 1.6, N)
+        found, _ = skin.evidence(
+            False, pressed=everything, press_units=press_units, silent_s=silent_s
+        )
+        assert found is False, seed
 
 
 def test_pads_that_are_hardly_received_do_not_count() -> None:
