@@ -22,6 +22,9 @@ def leave_if_cancelled() -> None:
     (`asyncio.wait_for` and `asyncio.TaskGroup` of Python 3.11): the loop would go on, and who
     cancelled it would wait for ever.
 
+    The block of a group must wait for its tasks itself: of one that fails when the block is over,
+    Python 3.11 leaves the group's own task marked as cancelled.
+
     Raises:
         CancelledError: it was.
     """

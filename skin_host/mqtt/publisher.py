@@ -63,7 +63,7 @@ from skin_host.mqtt.topics import OFFLINE, ONLINE, PartTopic, Topics
 from skin_host.mqtt.trials import TRIES, Trials
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.tasks import leave_if_cancelled
+from skin_host.tasks import cancel, leave_if_cancelled
 
 FRAME_EXPIRY_S = 1
 #: A request of 64 KiB, with its topic and properties.
@@ -429,8 +429,7 @@ class Publisher:
             ]
             await self._closing.wait()
             await self._outbox.drained()
-            for worker in workers:
-                worker.cancel()
+            await cancel(*workers)
 
     def _note_connected(self, connection: Connection) -> None:
         if connection is not self._connection:

@@ -282,11 +282,14 @@ class Viewer:
                     self._client = client
                     await cancel(waiting)
                     picture = self._picture
-                    group.create_task(_pass_on(client.frames(), _timed(picture.take_frame)))
-                    group.create_task(_pass_on(client.contacts(), picture.take_contact))
-                    group.create_task(_pass_on(client.health(), _timed(picture.take_health)))
-                    group.create_task(self._follow(client))
-                    group.create_task(self._watch(client))
+                    works = (
+                        _pass_on(client.frames(), _timed(picture.take_frame)),
+                        _pass_on(client.contacts(), picture.take_contact),
+                        _pass_on(client.health(), _timed(picture.take_health)),
+                        self._follow(client),
+                        self._watch(client),
+                    )
+                    await asyncio.wait([group.create_task(work) for work in works])
             except* SkinError as errors:
                 said, self._why = self._why, str(errors.exceptions[0])
                 if self._why != said:

@@ -372,6 +372,25 @@ async def test_stopping_sends_what_waits_and_says_offline(mosquitto: Mosquitto) 
     assert seen.touches() == list(range(1, 201))
 
 
+async def test_stopping_sends_what_waits_though_the_connection_is_lost_meanwhile(
+    mosquitto: Mosquitto,
+) -> None:
+    async with listening(mosquitto) as seen:
+        publisher = Publisher(settings(mosquitto), "robot", drain_s=PATIENCE_S)
+        await publisher.__aenter__()
+        await until(lambda: publisher.counters.connected)
+        for number in range(200):
+            publisher.put_touch(touch(number))
+        stopping = asyncio.create_task(publisher.__aexit__())
+        await until(publisher._closing.is_set)
+        assert publisher._connection is not None
+        publisher._connection.cut()
+        await stopping
+        await until(lambda: seen.payloads("status")[-1:] == [b"offline"])
+    assert sorted(set(seen.touches())) == list(range(1, 201))
+    assert publisher.counters.connections == 2
+
+
 @pytest.mark.parametrize("state", ["absent", "frozen"])
 async def test_stopping_does_not_wait_for_a_broker_that_does_not_answer(
     mosquitto: Mosquitto, state: str
