@@ -429,7 +429,7 @@ class Publisher:
             ]
             await self._closing.wait()
             await self._outbox.drained()
-            await cancel(*workers)
+            await cancel(*workers)  # here, not at the end of the block: see `leave_if_cancelled`
 
     def _note_connected(self, connection: Connection) -> None:
         if connection is not self._connection:

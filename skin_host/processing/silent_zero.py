@@ -215,7 +215,7 @@ class SilentZero:
     def _most_are_pressed(self) -> bool:
         """Return whether most pads, touched before or not, read more than all may drift by."""
         seen = (self._known | self.touched) & (self._count >= FEWEST)
-        most_units = COMMON_SIGMAS * math.hypot(COMMON_UNITS, max(self._drifted_units))
+        most_units = COMMON_SIGMAS * _common_units(max(self._drifted_units))
         return bool(
             2 * np.count_nonzero(self._sum[seen] > most_units * self._count[seen]) > seen.sum()
         )
@@ -251,11 +251,16 @@ class SilentZero:
         )
 
 
+def _common_units(drifted_units: float) -> float:
+    """How far all pads of a board may have moved alike (standard deviation)."""
+    return math.hypot(COMMON_UNITS, drifted_units)
+
+
 def _of_drift(residual: Floats, variance: Floats, drifted_units: float) -> float:
     """Return the logarithm of the likelihood of residuals [n] after a drift of about so many units,
     whatever moved them together.
     """
-    common_units = math.hypot(COMMON_UNITS, drifted_units)
+    common_units = _common_units(drifted_units)
     variance = variance + OWN_UNITS**2 + (APART_SHARE * drifted_units) ** 2
     most = COMMON_SIGMAS * common_units
     common = np.arange(-most, most + STEP_UNITS, STEP_UNITS)

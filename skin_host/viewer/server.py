@@ -289,6 +289,7 @@ class Viewer:
                         self._follow(client),
                         self._watch(client),
                     )
+                    # Here, not at the end of the block: see `leave_if_cancelled`.
                     await asyncio.wait([group.create_task(work) for work in works])
             except* SkinError as errors:
                 said, self._why = self._why, str(errors.exceptions[0])

@@ -205,7 +205,8 @@ class Accusations:
                 over is None
                 or now_ns - over < longest_ns
                 or trouble.lingers
-                or code in LASTING | trouble.lasting
+                or code in LASTING
+                or code in trouble.lasting
             )
             for trouble, _, over in self.troubles
         )

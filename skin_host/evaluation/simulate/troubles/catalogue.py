@@ -78,22 +78,17 @@ KINDS: dict[str, Begin] = {
     ),
     "clock_stretched": emulated("clock_stretched", SWAPPED, _ELSEWHERE | _LINE, 1.0, spoils=True),
     # What a wrong bit does to a reading, or to the board that takes it for a missing chip.
-    "bit_flipped": emulated(
-        "bit_flipped",
-        SWAPPED | {"bus_bit_errors"},
-        _WRONG_BITS,
-        4.0,
-        spoils=True,
-        lasting=_WRONG_ZERO,
-    ),
-    "slow_rise": emulated(
-        "slow_rise",
-        SWAPPED | {"bus_bit_errors"},
-        _WRONG_BITS,
-        4.0,
-        spoils=True,
-        lasting=_WRONG_ZERO,
-    ),
+    **{
+        name: emulated(
+            name,
+            SWAPPED | {"bus_bit_errors"},
+            _WRONG_BITS,
+            4.0,
+            spoils=True,
+            lasting=_WRONG_ZERO,
+        )
+        for name in ("bit_flipped", "slow_rise")
+    },
     "brown_out": emulated(
         "brown_out",
         SWAPPED,
