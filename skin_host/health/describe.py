@@ -300,6 +300,7 @@ class Describer:
             span = slice(layout.start, layout.stop)
             moved = np.abs(pipeline.baseline[span] - calibration.baseline[span])
             limit = self._engine.settings.processing.drift.limit_units
+            found["returned"] = pipeline.returned(part)
             found["drifting"] = (moved > DRIFTING_SHARE * limit) & calibration.usable[span]
         # A temperature pad that fails spoils the correction of its triangle. Out of its range it is
         # only warm.

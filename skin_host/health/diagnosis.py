@@ -72,6 +72,9 @@ _TAXEL_FAULTS = {
     "stuck": "the same byte for too long in a triangle that otherwise works; not valid",
     "noisy": "much noisier than when calibrated; not valid",
     "out_of_range": "far out of range; not valid",
+    "returned": "as high again as the zero was before it fell: pressed as when that was taken, or "
+    "the zero has come back; not valid until it is released; if nothing touches: skin command "
+    "calibrate",
     "drifting": "has moved far from its calibration; calibrate when nothing touches the skin",
 }
 

@@ -7,7 +7,7 @@ taxels of its part have in common, and a part of what its own reading has beyond
 |---|---|---|
 | idle | nothing touches the part | by the rule |
 | disturbed | something touches the part elsewhere or loads it; or fallen | `ALONE_UNITS_PER_S` |
-| touched | touched, or not received | a slow rise, up to `SLOW_UNITS_PER_S` |
+| touched | touched, not received, or returned | a slow rise, up to `SLOW_UNITS_PER_S` |
 | recovering | `SETTLE_S` after a touch; or fallen for so long | by the rule; the whole fall |
 
 | in common | when | is followed |
@@ -30,8 +30,9 @@ What the readings can distinguish, and what they cannot:
   recover. What reads more and more after a touch is a grip that was eased, against which the
   foam pushes back: it is not followed, and what was taken for drift since the touch ended is given
   back.
-- What remains of a released contact, and a return to where the baseline was before a fall, is
-  no touch: nothing latches.
+- What remains of a released contact is no touch: nothing latches.
+- What returns to where its baseline was before a fall is pressed again as it was when its zero was
+  taken, or was pulled and is free. Nobody can tell until it falls again: it is not valid.
 """
 
 import math
@@ -92,6 +93,8 @@ UNCERTAIN_UNITS = 2.0
 #: So is one, after this time, of a taxel that has been touched ever since it came into use: no
 #: reading has shown yet that it is right. After a night it may not be.
 UNSHOWN_S = 60.0
+#: What has returned has fallen again when it reads less than this share of what it fell by.
+LIFTED_SHARE = 0.5
 #: For this long a baseline may return after a fall, and thermal evidence lasts.
 MEMORY_S = 3600.0
 #: Thermal evidence, in units^2 s, that weighs as much as the assumption of no relation.
@@ -148,6 +151,8 @@ class BaselineTracker:
             they are released, as they have not yet.
         is_released: whether most of the taxels that were pressed of late are free, which shows that
             what pressed the part has gone.
+        returned: bool[n], taxels that read what their baseline was before it fell: they are pressed
+            again, or it has returned. The array changes only by being replaced.
     """
 
     def __init__(
@@ -164,6 +169,7 @@ class BaselineTracker:
         self.shared_units: Array | float = 0.0
         self.owed_units: Array | float = 0.0
         self.is_released = False
+        self.returned: Mask = np.zeros(n, np.bool_)
         self._configure(usable, settings)
         self._thermal = _ThermalReference(triangle, thermal) if np.any(thermal) else None
         #: Whether something may press on the whole part without any of its taxels being touched
@@ -227,7 +233,7 @@ class BaselineTracker:
         if self._settings.rule == "none" or dt_s <= 0.0:
             return None
         touched = touched & self._usable
-        hidden = self._usable & (touched | missing)
+        hidden = self._usable & (touched | missing | self.returned)
         free = self._usable & ~hidden
         self._shown |= free
         of_late = self._touches.touched_s > RECOVERED_S
@@ -249,7 +255,7 @@ class BaselineTracker:
             change = self._own(units - common, self._settings.rate_units_per_s * dt_s, dt_s)
             self._move(change + common, common, forecast)
             return None
-        state = self._states(units, touched, hidden, recovering, dt_s)
+        state = self._states(units, touched | self.returned, hidden, recovering, dt_s)
         held = recovering & ~self._remains(units, hidden, dt_s)
         state[held | (free & (self._loaded_s > 0.0))] = State.DISTURBED
         change = self._followed(units, common, state, dt_s)
@@ -269,8 +275,7 @@ class BaselineTracker:
         ended = recovering & (self._free_s <= dt_s) & (self._taken_s <= 0.0)
         self._by_itself = (self._by_itself | ended) & ~released
         change += self._given_back(units, level, touched, released | ended, dt_s)
-        back = still & self._back(level, dt_s)
-        change[back] = (self._former - self.baseline)[back]
+        self._note_returns(level, still, missing, dt_s)
         self._move(change, common, forecast)
         self._unsettled = self._touches.fading or bool(
             np.count_nonzero(self._fallen_s)
@@ -278,7 +283,7 @@ class BaselineTracker:
             or np.count_nonzero(self._taken_s > 0.0)
             or np.count_nonzero(self._loaded_s > 0.0)
         )
-        found = np.flatnonzero((released | back) & touched)
+        found = np.flatnonzero(released)
         return found if len(found) else None
 
     def pass_gap(self, gap_s: float) -> None:
@@ -296,6 +301,7 @@ class BaselineTracker:
             memory[taxels] = 0.0
         self._apart[taxels] = 0.0
         self._shown[taxels] = False
+        self.returned = self.returned & ~taxels
         if self._thermal is not None:
             self._thermal.forget(taxels)
 
@@ -305,6 +311,7 @@ class BaselineTracker:
         if settings.rule == "none":
             # Nothing moves that a touch could hold, and nothing would end what is known of touches.
             self._touches = _Touches(len(zeroed))
+            self.returned = np.zeros(len(zeroed), np.bool_)
         self.forget(zeroed)
 
     def _configure(self, usable: Mask, settings: Drift) -> None:
@@ -498,12 +505,19 @@ class BaselineTracker:
             self._former[new] = self.baseline[new]
             self._former_s[new] = MEMORY_S
 
-    def _back(self, level: Array, dt_s: float) -> Mask:
-        """Return which taxels [n] read again as they did before a fall."""
-        self._former_s -= dt_s
+    def _note_returns(self, level: Array, still: Mask, missing: Mask, dt_s: float) -> None:
+        """Note which taxels [n] read again as they did before a fall, until they fall again.
+
+        Then something had pressed them, and their baseline is right as it is.
+        """
+        self._former_s -= np.where(self.returned, 0.0, dt_s)
         rise = self._former - self.baseline
         near = np.abs(level - self._former) < 2.0 * TOLERANCE_UNITS
-        return (self._former_s > 0.0) & (rise > -FALLEN_UNITS) & near
+        new = still & (self._former_s > 0.0) & (rise > -FALLEN_UNITS) & near & ~self.returned
+        lifted = self.returned & ~missing & (level - self.baseline < LIFTED_SHARE * rise)
+        self._former_s[lifted] = 0.0
+        if np.count_nonzero(new) or np.count_nonzero(lifted):
+            self.returned = (self.returned | new) & ~lifted
 
 
 class _Touches:

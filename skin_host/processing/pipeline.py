@@ -224,6 +224,12 @@ class Pipeline:
         """Return taxels [m] of a part that have been touched for so long that it is reported."""
         return self._parts[part_index].drift.frozen
 
+    def returned(self, part_index: int) -> Mask:
+        """Return taxels [m] of a part that are pressed again, or whose zero has come back: they
+        are not valid.
+        """
+        return self._parts[part_index].drift.returned
+
     def at_limit(self, part_index: int) -> Mask:
         """Return taxels [m] of a part whose baseline has drifted to its limit."""
         return self._parts[part_index].drift.at_limit
@@ -513,6 +519,8 @@ class _PartPipeline:
             self._bridge(gap_s)
         if own is not None and own.erratic.any:
             valid = valid & ~own.erratic.pads
+        if any_of(self.drift.returned):
+            valid = valid & ~self.drift.returned
         idle = self._felt.detector.is_idle(self._last_raw)
         if self._called is not self._felt:
             idle = self._called.detector.is_idle(self._last_raw) and idle

@@ -35,7 +35,7 @@ def test_every_fault_is_explained() -> None:
     source = Path(diagnosis.__file__).read_text()
     codes = set(re.findall(r'"((?:bus|board|line|triangle|taxel|part)s?_[a-z_]+)"', source))
     codes |= {"triangle_" + fault.replace(" ", "_") for fault in diagnosis._TRIANGLE_SENTENCES}
-    codes |= {f"taxel_{kind}" for kind in ("stuck", "noisy", "out_of_range", "drifting")}
+    codes |= {f"taxel_{kind}" for kind in diagnosis._TAXEL_FAULTS}
     keys = set(BoardHealth.__annotations__) | set(BusHealth.__annotations__)
     codes -= keys | {"taxel_faults", "taxel_verdicts", "board_", "triangle_"}
     assert len(codes) > 30

@@ -139,6 +139,7 @@ ELSEWHERE = {
     "board_wrong_type": "tests/bus/test_boards.py",
     "bus_stranger": "tests/bus/test_boards.py",
     "host_stalls": "tests/health/test_honest.py",
+    "taxel_returned": "tests/health/test_taxels.py",
     "fingertip_absent": "tests/fingertip/test_boards.py",
     "fingertip_frozen": "tests/fingertip/test_boards.py",
     "fingertip_held": "tests/fingertip/test_boards.py",

@@ -25,6 +25,21 @@ pressure_kpa = [[0, 0], [0.2, 100], [600, 100]]
 start_s = 12
 """
 
+BACK_SCENE = """
+about = "Something lies on the forearm while it is calibrated, is lifted, put back, and so on."
+spread = false
+
+[[probe]]
+part = "left_forearm"
+at = { taxel = 27 }
+diameter_mm = 12
+pressure_kpa = [
+    [0, 0], [0.2, 60], [30, 60], [30.2, 0], [45, 0],
+    [45.2, 60], [60, 60], [60.2, 0], [75, 0], [75.2, 60], [90, 60],
+]
+start_s = 7
+"""
+
 
 def codes(bench: FaultBench, part: str) -> set[str]:
     return {fault["code"] for fault in bench.records[part]["faults"]}
@@ -73,6 +88,41 @@ def test_a_touch_that_never_ends_hides_a_zero_and_that_is_told(tmp_path: Path) -
     # It is touched all the same, and believed.
     assert bench.touched["left_forearm"][27]
     assert bench.valid["left_forearm"][27]
+
+
+def test_what_a_load_of_the_calibration_presses_again_is_in_doubt_until_it_is_lifted(
+    tmp_path: Path,
+) -> None:
+    """The zero followed when it was lifted. What reads as high as before may be that load, or a pad
+    that was pulled and is free: the first time nobody can tell.
+    """
+    scene = tmp_path / "back.toml"
+    scene.write_text(BACK_SCENE)
+    bench = FaultBench(3.0, scene=load(scene), settle_s=3.0)
+    pressed = np.flatnonzero(_after(bench, 15.0).touched["left_forearm"])
+    assert len(pressed) == 7
+    bench.calibrate(3.0)
+    assert not _after(bench, 45.0).touched["left_forearm"].any()
+    assert "taxel_returned" not in codes(bench, "left_forearm")
+
+    _after(bench, 66.0)
+    assert not bench.valid["left_forearm"][pressed].any()
+    record = bench.records["left_forearm"]
+    assert record["state"] == "degraded"
+    assert record["taxel_faults"]["returned"] == pressed.tolist()
+    (sentence,) = (line for line in record["sentences"] if "was before it fell" in line)
+    assert "skin command calibrate" in sentence
+
+    _after(bench, 81.0)
+    assert "taxel_returned" not in codes(bench, "left_forearm")
+    assert bench.valid["left_forearm"][pressed].all()
+    assert np.array_equal(np.flatnonzero(_after(bench, 96.0).touched["left_forearm"]), pressed)
+
+
+def _after(bench: FaultBench, t_s: float) -> FaultBench:
+    """The same, at this time."""
+    bench.run(t_s - bench.t_s)
+    return bench
 
 
 def test_taxels_that_no_press_reaches_are_named_with_the_reason_and_what_mends_it(

@@ -217,17 +217,52 @@ def test_a_bulge_is_not_followed_while_it_is_short_or_something_is_touched():
     assert np.abs(track.baseline).max() < 0.5
 
 
-@pytest.mark.parametrize("pulled", [4, N])
-def test_a_baseline_that_fell_is_known_again_when_its_taxel_returns(pulled):
-    track = tracker()
-    away = np.arange(N) < pulled
+def fall_and_return(track, away, beside=0.0):
+    """Some taxels read 30 units less for ten minutes, and then what they read before."""
     for _ in range(600):
         track.step(np.where(away, -30.0, 0.0) - track.baseline, NOBODY, NOBODY, 1.0)
-    assert track.baseline[:pulled] == pytest.approx(np.full(pulled, -30.0))
-    found = [track.step(-track.baseline, away, NOBODY, 1.0) for _ in range(2)]
-    assert found[0] is None
-    assert list(found[1]) == list(range(pulled))
-    assert np.abs(track.baseline).max() < 0.5
+    back = np.where(away, beside, 0.0)
+    return [track.step(back - track.baseline, away, NOBODY, 1.0) for _ in range(2)]
+
+
+@pytest.mark.parametrize("fallen", [4, N])
+def test_what_returns_to_where_it_was_before_a_fall_is_in_doubt(fallen):
+    """It may be pressed as it was when its zero was taken, or was pulled and is free."""
+    track = tracker()
+    away = np.arange(N) < fallen
+    assert fall_and_return(track, away) == [None, None]
+    assert np.array_equal(track.returned, away)
+    for _ in range(7200):
+        track.step(np.where(away, 5.0, 0.0) - track.baseline, NOBODY, NOBODY, 1.0)
+    assert np.array_equal(track.returned, away)
+    assert track.baseline[:fallen] == pytest.approx(np.full(fallen, -30.0), abs=0.5)
+
+
+def test_what_falls_again_was_pressed_and_is_believed_from_then_on():
+    track = tracker()
+    away = np.arange(N) < 4
+    fall_and_return(track, away)
+    unknown = np.where(away, 0.0, -track.baseline)
+    track.step(unknown, NOBODY, away, 1.0)
+    assert np.array_equal(track.returned, away)
+    track.step(np.where(away, -16.0, 0.0) - track.baseline, NOBODY, NOBODY, 1.0)
+    assert not track.returned.any()
+    track.step(np.where(away, -30.0, 0.0) - track.baseline, NOBODY, NOBODY, 1.0)
+    for _ in range(10):
+        track.step(-track.baseline, away, NOBODY, 1.0)
+    assert not track.returned.any()
+    assert track.baseline[:4] == pytest.approx(np.full(4, -30.0), abs=0.5)
+
+
+def test_a_new_zero_ends_the_doubt_and_so_does_the_end_of_tracking():
+    track = tracker()
+    away = np.arange(N) < 4
+    fall_and_return(track, away)
+    track.baseline[0] = 0.0
+    track.forget(np.arange(N) == 0)
+    assert np.array_equal(np.flatnonzero(track.returned), [1, 2, 3])
+    track.renew(np.ones(N, bool), NOBODY, Drift(rule="none"))
+    assert not track.returned.any()
 
 
 def warm(track, touched, rate, seconds):
@@ -736,15 +771,12 @@ def test_where_the_zero_of_a_temperature_pad_is_does_not_matter():
     assert followed(0.0) == pytest.approx(3.0, abs=0.3)
 
 
-@pytest.mark.parametrize(("beside", "known"), [(0.9, True), (-0.9, True), (1.2, False)])
-def test_within_a_unit_of_where_it_was_a_taxel_has_returned(beside, known):
+@pytest.mark.parametrize(("beside", "returned"), [(0.9, True), (-0.9, True), (1.2, False)])
+def test_within_a_unit_of_where_it_was_a_taxel_has_returned(beside, returned):
     track = tracker()
     away = np.arange(N) < 4
-    for _ in range(600):
-        track.step(np.where(away, -30.0, 0.0) - track.baseline, NOBODY, NOBODY, 1.0)
-    back = np.where(away, beside, 0.0)
-    found = [track.step(back - track.baseline, away, NOBODY, 1.0) for _ in range(2)]
-    assert (found[1] is not None) is known
+    fall_and_return(track, away, beside)
+    assert track.returned[:4].all() == returned
 
 
 def test_fewer_than_four_taxels_that_have_not_fallen_do_not_move_the_part():

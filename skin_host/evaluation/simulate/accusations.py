@@ -42,6 +42,7 @@ LASTING = {
     "taxel_held",
     "taxel_pressed",
     "taxel_refused",
+    "taxel_returned",
     "taxel_saturates",
 }
 #: All others end with their cause, after the time that a board's next set-up may take (8 s until it

@@ -9,6 +9,7 @@ TAXELS = {
     "taxel_held",
     "taxel_refused",
     "taxel_pressed",
+    "taxel_returned",
     "taxel_saturates",
     "taxel_unproven",
 }
@@ -37,6 +38,7 @@ TIMING = {"board_jitter", "board_period", "bus_loses_frames"}
 CHIPS = TAXELS | TRIANGLES
 #: Verdicts of a calibration that was taken meanwhile.
 CALIBRATED = {"taxel_refused", "taxel_saturates", "taxel_drifting", "taxel_at_limit"}
+CALIBRATED |= {"taxel_returned"}
 DAMAGED = {"bus_bit_errors", "bus_stranger", "bus_babbling"}
 DAMAGED |= {"fingertip_saturated", "fingertip_held", "fingertip_noisy", "fingertip_unreached"}
 #: A force/torque board that is not received, or not asked yet for its full scales.
