@@ -32,7 +32,7 @@ What the readings can distinguish, and what they cannot:
   back.
 - What remains of a released contact is no touch: nothing latches.
 - What returns to where its baseline was before a fall is pressed again as it was when its zero was
-  taken, or was pulled and is free. Nobody can tell until it falls again: it is not valid.
+  taken, or was pulled and is free. It is not valid until it falls again, which shows the first.
 """
 
 import math

@@ -94,7 +94,7 @@ def test_what_a_load_of_the_calibration_presses_again_is_in_doubt_until_it_is_li
     tmp_path: Path,
 ) -> None:
     """The zero followed when it was lifted. What reads as high as before may be that load, or a pad
-    that was pulled and is free: the first time nobody can tell.
+    that was pulled and is free: the first time no reading shows which.
     """
     scene = tmp_path / "back.toml"
     scene.write_text(BACK_SCENE)
