@@ -19,6 +19,8 @@ What the readings can distinguish, and what they cannot:
 
 - A load only raises a reading, so a fall of all taxels alike is drift or a release, at any
   rate. An even load of the whole part that rises slowly reads like drift, and is taken for it.
+- A load that presses most of a part while its zeros are taken is in them. When it lifts, most of
+  the part reads below its zeros, even if only between steps: they are followed at once.
 - A touch makes the skin around it bulge: untouched taxels read several units less while it
   lasts. If they were followed, they would read as touched afterwards.
 - A hand warms what it holds, within minutes. A slow rise of a touched taxel is taken for that;
@@ -64,6 +66,11 @@ SLOW_UNITS_PER_S = 0.01
 ALONE_UNITS_PER_S = 0.0005
 #: Normal drift never goes this far below the baseline: the skin bulges, or was loaded before.
 FALLEN_UNITS = -2.5
+#: So many taxels may bulge beside each that is touched.
+BULGED = 10
+#: By so many deviations of single readings noise takes the lowest of some means below the level,
+#: even where it jumps between two levels.
+LOWEST_DEVIATIONS = 1.5
 #: Bulges without a touch are shorter, and so are the pauses of a flickering touch.
 SETTLE_S = 5.0
 #: A taxel recovers until the stored time in touch has faded to this.
@@ -179,6 +186,8 @@ class BaselineTracker:
         self._behind = False
         #: Whether any taxel is not idle.
         self._unsettled = False
+        #: For how long it yet counts that each taxel read below its zero as most of the part did.
+        self._below_s: Array = np.zeros(n)
         self._fallen_s: Array = np.zeros(n)
         self._former: Array = np.zeros(n)
         self._former_s: Array = np.zeros(n)
@@ -213,6 +222,7 @@ class BaselineTracker:
         dt_s: float,
         relaxed_units: Array | float = 0.0,
         conversions: Array | float = CONVERSIONS,
+        lowest: tuple[Array, Array] | None = None,
     ) -> NDArray[np.intp] | None:
         """Move the baselines, in place.
 
@@ -224,6 +234,8 @@ class BaselineTracker:
             dt_s: that time. Where it is 0, nothing has changed.
             relaxed_units: the relaxation [n] that units was corrected for.
             conversions: how many independent measurements are in each mean, a number or [n].
+            lowest: the lowest activation [n] of a shorter time in it, by default the mean, and the
+                noise [n] of single readings.
 
         Returns:
             Numbers of taxels whose touch was recognised as drift, or None. Their baselines have
@@ -248,10 +260,13 @@ class BaselineTracker:
 
         received = int(np.count_nonzero(self._usable & ~missing))
         shows = free & ~recovering
+        low, noise = (units, 0.0) if lowest is None else lowest
+        low = low + relaxed_units
+        lifted = self._lifted(low, noise, touched, missing, received, dt_s)
         share = _share(conversions)
         common = self._common(units, shows, received, np.where(shows | missing, share, 1.0), dt_s)
         self.shared_units = common if forecast is None else common + forecast
-        if self._is_calm(units, common, hidden, dt_s):
+        if lifted is None and self._is_calm(units, common, hidden, dt_s):
             change = self._own(units - common, self._settings.rate_units_per_s * dt_s, dt_s)
             self._move(change + common, common, forecast)
             return None
@@ -261,7 +276,9 @@ class BaselineTracker:
         change = self._followed(units, common, state, dt_s)
         fallen = self._fallen_s >= SETTLE_S
         change[fallen] = units[fallen]
-        self._expect_back(fallen if common > FALLEN_UNITS else free)
+        if lifted is not None:
+            fallen = fallen | lifted
+        self._expect_back(fallen if common > FALLEN_UNITS else free | fallen)
         if abs(common) <= QUICK_UNITS_PER_S * dt_s:
             self._note_drift(common)
 
@@ -275,6 +292,8 @@ class BaselineTracker:
         ended = recovering & (self._free_s <= dt_s) & (self._taken_s <= 0.0)
         self._by_itself = (self._by_itself | ended) & ~released
         change += self._given_back(units, level, touched, released | ended, dt_s)
+        if lifted is not None:
+            change[lifted] = low[lifted]
         self._note_returns(level, still, missing, dt_s)
         self._move(change, common, forecast)
         self._unsettled = self._touches.fading or bool(
@@ -297,7 +316,8 @@ class BaselineTracker:
         np.copyto(self.calibrated, self.baseline, where=taxels)
         self._configure(self._usable, self._settings)
         touched_s = self._touches.touched_s
-        for memory in (self._fallen_s, self._former_s, self._taken_s, self._loaded_s, touched_s):
+        memories = (self._fallen_s, self._former_s, self._taken_s, self._loaded_s)
+        for memory in (*memories, self._below_s, touched_s):
             memory[taxels] = 0.0
         self._apart[taxels] = 0.0
         self._shown[taxels] = False
@@ -388,6 +408,33 @@ class BaselineTracker:
             or np.count_nonzero(hidden)
             or np.count_nonzero((units < FALLEN_UNITS) & self._usable)
         )
+
+    def _lifted(
+        self,
+        low: Array,
+        noise: Array | float,
+        touched: Mask,
+        missing: Mask,
+        received: int,
+        dt_s: float,
+    ) -> Mask | None:
+        """Return from which taxels [n] a load has lifted that pressed most of the part when its
+        zeros were taken, or None: in two windows most of it has read below its zeros.
+
+        Args:
+            low: lowest reading [n] of each, relaxation included: no model of the foam makes it so.
+            noise: of single readings [n].
+            touched, missing, dt_s: see `step`; received: see `_common`.
+        """
+        below = (low < FALLEN_UNITS) & self._usable & ~missing
+        surely = below & (low + LOWEST_DEVIATIONS * noise < FALLEN_UNITS)
+        bulged = BULGED * np.count_nonzero(touched & ~below)
+        if 2 * np.count_nonzero(surely) <= received or np.count_nonzero(surely) <= bulged:
+            self._below_s -= dt_s
+            return None
+        lifted = below & (self._below_s > 0.0)
+        self._below_s = np.where(below, SETTLE_S, self._below_s - dt_s)
+        return lifted if np.count_nonzero(lifted) else None
 
     def _move(self, change: Array, common: float, forecast: Array | None) -> None:
         """Move the baselines, within their limits, by `common` and what each moves beyond it."""

@@ -324,6 +324,7 @@ class _Window:
 
     Attributes:
         sum_kpa: float32[m], of the pressures without the relaxation.
+        lowest_kpa: float32[m], lowest mean of `ROWS` samples, infinite if there are not so many.
         samples: how many they are.
         skipped: sweeps that no sample stands for.
         elapsed_s: how long they all took.
@@ -331,11 +332,13 @@ class _Window:
 
     def __init__(self, m: int) -> None:
         self.sum_kpa = np.zeros(m, np.float32)
+        self.lowest_kpa = np.empty(m, np.float32)
         self.clear()
 
     def clear(self) -> None:
         """Begin the next."""
         self.sum_kpa.fill(0.0)
+        self.lowest_kpa.fill(np.inf)
         self.samples = 0
         self.skipped = 0
         self.elapsed_s = 0.0
@@ -343,6 +346,7 @@ class _Window:
     def add(self, piece: "_Window") -> None:
         """Add what followed."""
         np.add(self.sum_kpa, piece.sum_kpa, out=self.sum_kpa)
+        np.fmin(self.lowest_kpa, piece.lowest_kpa, out=self.lowest_kpa)
         self.samples += piece.samples
         self.skipped += piece.skipped
         self.elapsed_s += piece.elapsed_s
@@ -830,7 +834,11 @@ class _PartPipeline:
         sweeps = window.samples + window.skipped
         touched, missing = self._was_touched, 2 * self._lacking > sweeps
         conversions = self._conversions(window)
-        ghosts = self.drift.step(units, touched, missing, elapsed_s, relaxed_units, conversions)
+        lowest = self._units(np.fmin(window.lowest_kpa, mean_kpa))
+        spread = self._rules.levels.spread
+        ghosts = self.drift.step(
+            units, touched, missing, elapsed_s, relaxed_units, conversions, (lowest, spread)
+        )
         if self._own is not None:
             ghosts = self._own.hold_rises(self.drift, before, touched, elapsed_s, ghosts)
         if ghosts is not None:
@@ -876,7 +884,11 @@ class _PartPipeline:
         np.add.reduce(self._rows[: self._laid], axis=0, out=self._part_kpa)
         if self._own is not None and self._laid:
             self._own.fold(self._rows[: self._laid], self._part_kpa, self._relaxation_kpa)
-        np.add(self._piece.sum_kpa, self._part_kpa, out=self._piece.sum_kpa)
+        piece = self._piece
+        np.add(piece.sum_kpa, self._part_kpa, out=piece.sum_kpa)
+        if self._laid == ROWS:
+            np.multiply(self._part_kpa, np.float32(1.0 / ROWS), out=self._part_kpa)
+            np.fmin(piece.lowest_kpa, self._part_kpa, out=piece.lowest_kpa)
         self._laid = 0
 
     def _renew_limits(self) -> None:

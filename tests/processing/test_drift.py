@@ -782,9 +782,86 @@ def test_within_a_unit_of_where_it_was_a_taxel_has_returned(beside, returned):
 def test_fewer_than_four_taxels_that_have_not_fallen_do_not_move_the_part():
     track = tracker()
     fallen = np.where(np.arange(N) < 3, 0.0, -5.0 - np.arange(N))
+    track.step(fallen, NOBODY, NOBODY, 1.0)
+    assert track.baseline == pytest.approx(0.0, abs=0.001)
+
+
+def stride(track, lifts, relaxed=0.0, missing=NOBODY, noise=0.5, touched=NOBODY):
+    """A second in which a load that is in the zeros of some taxels is lifted for a moment."""
+    units = np.where(lifts, -3.0, 0.0) - track.baseline
+    lowest = np.where(lifts, -7.0, 0.0) - track.baseline
+    track.step(units, touched, missing, 1.0, relaxed, lowest=(lowest, np.full(N, noise)))
+
+
+@pytest.mark.parametrize(("lifted", "followed"), [(N // 2 + 1, True), (N // 2, False)])
+def test_a_load_in_the_zeros_of_most_of_a_part_is_known_after_two_steps(lifted, followed):
+    """Nothing else is below zero so widely; a bulge is beside a touch."""
+    track = tracker()
+    lifts = np.arange(N) < lifted
+    stride(track, lifts)
+    assert track.baseline[:lifted].min() > -4.0
+    stride(track, lifts)
+    assert bool(track.baseline[0] == pytest.approx(-7.0, abs=0.1)) == followed
+    assert np.abs(track.baseline[lifted:]).max() < 0.5
+
+
+@pytest.mark.parametrize(("pause_s", "known"), [(4, True), (6, False)])
+def test_two_steps_that_far_apart_are_one_each(pause_s, known):
+    track = tracker()
+    lifts = np.arange(N) < 20
+    stride(track, lifts)
+    for _ in range(pause_s):
+        follow(track, 0.0)
+    stride(track, lifts)
+    assert (track.baseline[0] < -6.5) == known
+
+
+def test_what_the_model_of_the_foam_takes_off_too_much_is_no_load_in_a_zero():
+    track = tracker()
     for _ in range(4):
-        track.step(fallen - track.baseline, NOBODY, NOBODY, 1.0)
-    assert track.baseline == pytest.approx(0.0, abs=0.01)
+        stride(track, np.arange(N) < 20, relaxed=5.0)
+    assert track.baseline.min() > -5.0
+
+
+@pytest.mark.parametrize(("beside", "bulges"), [(1, False), (2, True)])
+def test_most_of_a_small_part_may_bulge_beside_what_is_touched(beside, bulges):
+    track = tracker()
+    for _ in range(2):
+        stride(track, np.arange(N) < 20, touched=np.arange(N) >= N - beside)
+    assert (track.baseline[0] > -4.0) == bulges
+
+
+def test_what_is_touched_when_it_comes_back_was_loaded_all_the_same():
+    track = tracker()
+    lifts = np.arange(N) < 20
+    for _ in range(2):
+        stride(track, lifts, touched=lifts)
+    assert track.baseline[:20].max() < -6.5
+
+
+def test_what_noise_makes_low_is_no_load_in_a_zero():
+    track = tracker()
+    for _ in range(4):
+        stride(track, np.arange(N) < 20, noise=3.1)
+    assert track.baseline.min() > -5.0
+
+
+def test_taxels_that_are_missing_show_no_load_in_their_zeros():
+    track = tracker()
+    lifts = np.arange(N) < 20
+    for _ in range(4):
+        stride(track, lifts, missing=np.arange(N) < 10)
+    assert np.abs(track.baseline[:10]).max() < 0.5
+    assert track.baseline[10:20].max() < -6.5
+
+
+def test_a_new_zero_is_shown_to_be_wrong_by_its_own_steps_alone():
+    track = tracker()
+    lifts = np.arange(N) < 20
+    stride(track, lifts)
+    track.forget(np.ones(N, bool))
+    stride(track, lifts)
+    assert track.baseline.min() > -4.0
 
 
 def test_what_temperature_pads_showed_hours_ago_counts_less_than_what_they_show_now():

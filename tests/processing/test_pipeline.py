@@ -386,7 +386,25 @@ def test_frames_of_one_value_are_survived(raw):
     for _ in range(200):
         frame = rig.step(0.0)
     assert not frame.touched.any()
-    assert press(rig, 20.0, 5)[-1].touched[:6].all()
+    frame = press(rig, 20.0, 5)[-1]
+    # Seconds of 255 read as if a load had lifted that was in all zeros.
+    assert (frame.touched if raw < 255 else frame.touched | ~frame.valid)[:6].all()
+
+
+@pytest.mark.parametrize("half_s", [0.5, 1.0, 3.0])
+def test_what_stood_on_the_skin_when_it_was_calibrated_is_felt_after_some_steps(half_s):
+    """Zeros with a load in them are low where it lifts, for however short a time."""
+    rig = Rig(1, 0.5, processing=NO_RELAXATION)
+    load = np.linspace(5.0, 30.0, rig.n)
+    rig._resting += load.astype(np.float32)
+    steps = round(half_s / rig.dt_s)
+    for _ in range(round(12.0 / half_s)):
+        for units in (np.zeros(rig.n), load):
+            frames = [rig.step(units) for _ in range(steps)]
+    assert frames[-1].valid.all()
+    assert frames[-1].touched.mean() > 0.95
+    right = CURVE.kpa(load[rig.n // 2 :])
+    assert np.median(frames[-1].pressure_kpa[rig.n // 2 :] / right) == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_flickering_taxel_disturbs_no_other():
