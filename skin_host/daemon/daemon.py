@@ -441,18 +441,46 @@ class Daemon:
         self.publisher.put_contact(self.layout.parts[part].name, self._contacts[part].stop(events))
 
     async def _start(self, calibrate: bool) -> None:
-        """Bring the boards up, then calibrate if necessary."""
+        """Bring the boards up, and calibrate if necessary; no bus waits for one that is away."""
         async with asyncio.TaskGroup() as group:
-            group.create_task(self._report_ready())
-            await self.link.bring_up()
-        while calibrate or self.engine.calibration is None:
-            try:
-                await self.control.calibrate(self.settings.processing.calibration.seconds)
-                break
-            except SkinError as error:
-                log.warning("%s", error)
-                await self.clock.sleep(HEALTH_S)
+            ready = group.create_task(self._report_ready())
+            bringing = group.create_task(self.link.bring_up())
+            while not self.link.is_set_up():
+                await asyncio.wait([bringing], timeout=0.05)
+            await ready
+            while calibrate or self.engine.calibration is None:
+                away = self.link.away()
+                if await self._try_to_calibrate():
+                    for bus in away:
+                        group.create_task(self._calibrate_late(bus))
+                    break
         await asyncio.Event().wait()
+
+    async def _calibrate_late(self, bus: str) -> None:
+        """Calibrate the boards of a bus that was away when all others were calibrated, once they
+        are set up, unless somebody has done that.
+        """
+        while bus in self.link.away() or self._calibration_lock.locked():
+            await self.clock.sleep(HEALTH_S)
+        while (boards := self._not_calibrated(bus)) and not await self._try_to_calibrate(boards):
+            pass
+
+    def _not_calibrated(self, bus: str) -> list[int]:
+        """Return the boards of a bus of which no taxel has a usable zero."""
+        found, layout = self.engine.calibration, self.layout
+        assert found is not None
+        mine = [board for board in self.engine.boards if layout.boards[board].settings.bus == bus]
+        return [board for board in mine if not (found.usable & layout.taxels_of([board])).any()]
+
+    async def _try_to_calibrate(self, boards: list[int] | None = None) -> bool:
+        """Calibrate all, or boards by their index, and return True; or log why not, and pause."""
+        try:
+            await self.control.calibrate(self.settings.processing.calibration.seconds, boards)
+        except SkinError as error:
+            log.warning("%s", error)
+            await self.clock.sleep(HEALTH_S)
+            return False
+        return True
 
     async def _report_ready(self) -> None:
         """Report readiness: buses open, and first sweeps or a timeout. Health reports a dead

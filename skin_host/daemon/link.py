@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from functools import partial
 from itertools import chain
@@ -64,6 +65,12 @@ class OpenPort(Protocol):
         """See `bus.opening.open_port`."""
 
 
+def _close(opened: "Future[Port]") -> None:
+    """Close a port, if it could be opened."""
+    if not opened.cancelled() and opened.exception() is None:
+        opened.result().close()
+
+
 class Link:
     """Connects an engine to the buses that it needs.
 
@@ -100,6 +107,10 @@ class Link:
         self.ports: dict[str, Port] = {}
         self.boards: dict[str, Boards] = {}
         self.force_torque: dict[str, StrainBoards] = {}
+        #: Boards of which it is not known yet whether they can be set up; and those that could not
+        #: be so far, and are tried again.
+        self._untried: set[Boards | StrainBoards] = set()
+        self._failing: set[Boards | StrainBoards] = set()
         fingertips = engine.fingertips
         settings, layout = engine.settings, engine.layout
         periods_ns = {i: layout.boards[i].settings.period_ms * 1_000_000 for i in engine.boards}
@@ -126,7 +137,6 @@ class Link:
             sum(1e9 / period_ns for period_ns in fastest_ns),
         )
         self._expired_ns = 0
-        self._turned_ns = self.read_ns
         self._started_at_ns = self._now_started_at_ns()
         self._held_up_ns = max(LONGEST_NS, int(settings.receive.poll_ms * 1e6)) + HELD_UP_NS
         self._held_up_at_ns: int | None = None
@@ -142,9 +152,16 @@ class Link:
         self._zeroed_ns: dict[int, int] = {}
         #: Reads the buses and passes the results on, once `read` does that.
         self._work: Callable[[], None] = lambda: None
+        # Beside each other: what does not answer is waited for, and holds no other bus up.
+        openers = {bus: clock.executor(f"open {bus}") for bus in engine.assemblers}
+        open_one = partial(open_port, wait=wait, clock=clock)
+        opening = {
+            bus: opener.submit(open_one, bus, settings.buses[bus], settings.receive)
+            for bus, opener in openers.items()
+        }
         try:
             for bus in engine.assemblers:
-                port = open_port(bus, settings.buses[bus], settings.receive, wait=wait, clock=clock)
+                port = opening[bus].result()
                 port.on_sent = partial(self._note_sent, bus)
                 self.ports[bus] = port
                 mine = [
@@ -171,8 +188,15 @@ class Link:
                         bus, port, tips, lambda: engine.ledger.now_ns
                     )
         except SkinError:
-            self.close()
+            for opened in opening.values():
+                opened.add_done_callback(_close)
             raise
+        finally:
+            for opener in openers.values():
+                opener.close()
+        self._untried.update(self._all_boards())
+        # What opening takes is no stall of this computer.
+        self._turned_ns = clock.now_ns()
 
     def use(self, engine: Engine) -> None:
         """Continue with another engine, which has the ledger of the one before."""
@@ -378,6 +402,19 @@ class Link:
         """
         await asyncio.gather(*(self._bring_up(boards) for boards in self._all_boards()))
 
+    def is_set_up(self) -> bool:
+        """Whether all boards are set up that a calibration of all has to wait for: not those of
+        buses that are away, while others are received; but fingertips get no zero later.
+        """
+        if self._untried or not self._failing.isdisjoint(self.force_torque.values()):
+            return False
+        ready = [boards for boards in self.boards.values() if boards not in self._failing]
+        return not self._failing or any(any(self._sweeps_of(one).values()) for one in ready)
+
+    def away(self) -> set[str]:
+        """Return the buses whose boards could not be set up yet."""
+        return {bus for bus, boards in self.boards.items() if boards in self._failing}
+
     async def set_up(self, boards: list[int]) -> None:
         """Send boards, by index, their set-up again and start them.
 
@@ -424,8 +461,12 @@ class Link:
                     await boards.bring_up(listen=self._engine.calibration is not None)
                 else:
                     await boards.bring_up()
+                self._failing.discard(boards)
+                self._untried.discard(boards)
                 return
             except BusError as error:
+                self._failing.add(boards)
+                self._untried.discard(boards)
                 if str(error) != told:
                     log.warning("%s", error)
                     told = str(error)

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import socket
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -146,22 +147,24 @@ async def serve(port: int, records: Callable[[], Records], clock: Clock = SYSTEM
                 await writer.wait_closed()
             busy -= 1
 
+    begin = in_tasks(answer)
     said = False
     while True:
         try:
-            server = await asyncio.start_server(
-                in_tasks(answer), "127.0.0.1", port, limit=MAX_REQUEST_BYTES
-            )
+            with socket.create_server(("127.0.0.1", port)) as listening:
+                listening.setblocking(False)
+                # asyncio's server, where no more files may be open, tries as often as its queue is
+                # long, and multiplies these tries each second.
+                while True:
+                    connection, _ = await asyncio.get_running_loop().sock_accept(listening)
+                    begin(*await asyncio.open_connection(sock=connection, limit=MAX_REQUEST_BYTES))
+                    said = False
         except OSError as error:
             if not said:
                 said = True
                 why = os.strerror(error.errno) if error.errno else str(error)
                 log.warning("no metrics: 127.0.0.1:%d: %s; trying again", port, why)
-            await clock.sleep(RETRY_S)
-        else:
-            break
-    async with server:
-        await server.serve_forever()
+        await clock.sleep(RETRY_S)
 
 
 def _is_ours(header: bytes) -> bool:

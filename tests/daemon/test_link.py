@@ -1,5 +1,8 @@
 """Between the buses and the core: every sweep counts, however it was closed."""
 
+import contextlib
+import socket
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +12,16 @@ import pytest
 
 from skin_host.bus import wire
 from skin_host.bus.assembler import AssemblerCounters
+from skin_host.bus.port import LinkState
 from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings
 from skin_host.daemon.link import Link
+from skin_host.errors import BusError
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine, Output
 from tests.support.ports import StillPort
+from tests.support.waiting import PATIENCE_S
 
 MS = 1_000_000
 PERIOD = 50 * MS
@@ -257,3 +263,99 @@ def test_a_bus_whose_package_is_not_installed_leaves_the_others_live(
     assert link.ports["right"].counters.frames == 1
     assert "pip install 'python-can[serial]'" in link.ports["left"].unopened
     link.close()
+
+
+def test_buses_are_opened_beside_each_other(caplog: pytest.LogCaptureFixture) -> None:
+    """Four adapters that hung would hold a start up for 20 s, in which no other bus is read and no
+    signal is taken. Here a server of buses greets each client once both are there.
+    """
+    server = socket.create_server(("127.0.0.1", 0))
+    clients: list[socket.socket] = []
+    both = threading.Barrier(2)
+
+    def answer(client: socket.socket, is_first: bool) -> None:
+        with contextlib.suppress(OSError, threading.BrokenBarrierError):
+            if is_first:
+                both.wait()
+            for words in (b"< hi >", b"< ok >", b"< ok >"):
+                client.sendall(words)
+                client.recv(1000)
+
+    def accept() -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                clients.append(server.accept()[0])
+                arguments = (clients[-1], len(clients) <= 2)
+                threading.Thread(target=answer, args=arguments, daemon=True).start()
+
+    threading.Thread(target=accept, daemon=True).start()
+    options = {"host": "127.0.0.1", "port": server.getsockname()[1]}
+    names = ("left", "right")
+    settings = Settings(
+        robot="r",
+        buses={name: Bus(interface="socketcand", channel=name, options=options) for name in names},
+        boards={name: Board(bus=name, address=1) for name in names},
+        parts={name: Part(patches=[Patch(board=name, triangles="0")]) for name in names},
+    )
+    link = Link(Engine(settings, build_layout(settings, Path()), [0, 1]), wait=True)
+    try:
+        assert [*link.ports] == [*names]
+        assert {port.state for port in link.ports.values()} == {LinkState.UP}, caplog.text
+    finally:
+        both.abort()
+        link.close()
+        server.close()
+        for client in clients:
+            client.close()
+
+
+def test_a_bus_that_cannot_be_opened_leaves_no_other_one_open() -> None:
+    settings = Settings(
+        robot="r",
+        buses={"left": Bus(), "right": Bus()},
+        boards={name: Board(bus=name, address=1) for name in ("left", "right")},
+        parts={
+            name: Part(patches=[Patch(board=name, triangles="0")]) for name in ("left", "right")
+        },
+    )
+    opening, failed, closed = threading.Event(), threading.Event(), threading.Event()
+
+    class Opened(StillPort):
+        def close(self) -> None:
+            closed.set()
+
+    def open_one(name: str, *arguments: Any, **options: Any) -> StillPort:
+        if name == "left":
+            assert opening.wait(PATIENCE_S)
+            raise BusError("absent")
+        opening.set()
+        assert failed.wait(PATIENCE_S)
+        return Opened(name, *arguments, **options)
+
+    with pytest.raises(BusError, match="absent"):
+        Link(Engine(settings, build_layout(settings, Path()), [0, 1]), open_port=open_one)
+    failed.set()
+    assert closed.wait(PATIENCE_S)
+
+
+def test_the_time_that_opening_takes_is_no_stall_of_this_computer() -> None:
+    """An adapter that does not answer is waited for; health accused other work of the pause."""
+    settings = Settings(
+        robot="r",
+        buses={"can0": Bus()},
+        boards={"b": Board(bus="can0", address=1)},
+        parts={"p": Part(patches=[Patch(board="b", triangles="0")])},
+    )
+    clock = SteppedClock()
+
+    def open_slowly(*arguments: Any, **options: Any) -> StillPort:
+        clock.advance(5.0)
+        return StillPort(*arguments, **options)
+
+    engine = Engine(settings, build_layout(settings, Path()), [0])
+    link = Link(engine, open_port=open_slowly, clock=clock)
+    link.turn(clock.now_ns(), lambda _: None)
+    assert link.longest_pause_ns() == 0
+    clock.advance(5.0)
+    link.turn(clock.now_ns(), lambda _: None)
+    assert link.longest_pause_ns() == 5_000_000_000

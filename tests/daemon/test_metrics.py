@@ -1,8 +1,17 @@
 """The metrics are for programs of this computer, and for no page of another site."""
 
+import asyncio
+import errno
+import os
+import resource
+import socket
+
 import pytest
 
+from skin_host.daemon import metrics
 from skin_host.daemon.metrics import _response
+from tests.support.broker import free_port
+from tests.support.waiting import until
 
 PATH = b"GET /metrics HTTP/1.1\r\n"
 
@@ -42,3 +51,47 @@ def test_a_program_of_http_1_0_names_no_host() -> None:
 def test_a_page_whose_name_was_made_to_point_here_is_refused(headers: list[bytes]) -> None:
     """A browser asks under the name of the page's site, whatever address that has by now."""
     assert status(*headers) == b"HTTP/1.0 403 Forbidden"
+
+
+async def test_a_scraper_that_comes_while_no_more_files_may_be_open_costs_one_line(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """asyncio's own server tries as often as its queue is long, each second, and writes a traceback
+    for each of these, ever more.
+    """
+    monkeypatch.setattr(metrics, "RETRY_S", 0.05)
+    port = free_port()
+    serving = asyncio.create_task(metrics.serve(port, dict))
+    scrapers = [socket.socket() for _ in range(3)]
+    for one in scrapers:
+        one.setblocking(False)
+    loop = asyncio.get_running_loop()
+
+    async def scrape(scraper: socket.socket) -> bytes:
+        """Return the answer, up to the end of the connection."""
+        await until(lambda: scraper.connect_ex(("127.0.0.1", port)) in {0, errno.EISCONN})
+        await loop.sock_sendall(scraper, PATH + b"\r\n")
+        found = b""
+        while piece := await loop.sock_recv(scraper, 10_000):
+            found += piece
+        return found
+
+    assert (await scrape(scrapers[0])).startswith(b"HTTP/1.0 200")
+    lowest = os.dup(0)
+    os.close(lowest)
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest, before[1]))
+    try:
+        scrapers[1].connect_ex(("127.0.0.1", port))
+        await until(lambda: caplog.records)
+        for _ in range(50):
+            await asyncio.sleep(0.01)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert len(caplog.records) == 1
+    assert "no metrics" in caplog.text and "Too many open files" in caplog.text
+    assert (await scrape(scrapers[2])).startswith(b"HTTP/1.0 200")
+    serving.cancel()
+    await asyncio.gather(serving, return_exceptions=True)
+    for one in scrapers:
+        one.close()
