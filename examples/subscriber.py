@@ -8,7 +8,6 @@ import json
 import queue
 import sys
 import time
-from collections import defaultdict
 from dataclasses import dataclass
 from math import inf
 
@@ -32,6 +31,8 @@ STATES = ("ON", "OFF", "UNKNOWN")
 #: Reasons of a broker that would come again and again: unknown protocol, name of the client, user
 #: or password, not authorized, another client has our NAME.
 FINAL = {0x84, 0x85, 0x86, 0x87, 0x8E}
+#: Of more parts than robots have, nothing is kept: anybody may publish names without end.
+MOST_PARTS = 1000
 
 #: From paho's thread: a message, or why there is no connection, or a line about a new one.
 inbox: "queue.Queue[mqtt.MQTTMessage | ReasonCode | str]" = queue.Queue(10_000)
@@ -84,7 +85,16 @@ class Part:
             print(name, state, flush=True)
 
 
-def take(message: mqtt.MQTTMessage, parts: dict[str, Part]) -> None:
+class Parts(dict[str, Part]):
+    """Parts by name, each from its first message on."""
+
+    def __missing__(self, name: str) -> Part:
+        if len(self) >= MOST_PARTS:
+            raise ValueError("too many parts")
+        return self.setdefault(name, Part())
+
+
+def take(message: mqtt.MQTTMessage, parts: Parts) -> None:
     """Take a message.
 
     Raises:
@@ -96,8 +106,9 @@ def take(message: mqtt.MQTTMessage, parts: dict[str, Part]) -> None:
     sent = dict(getattr(message.properties, "UserProperty", ()))
     if kind == "status":
         if message.payload != b"online":  # contact and health are out of date (2)
-            for part in filter(None, sent.get("parts", "").split(",")):
-                parts[f"{name.split('/')[0]}/{part}"].forget()
+            for part in sent.get("parts", "").split(","):
+                if known := parts.get(f"{name.split('/')[0]}/{part}"):
+                    known.forget()
         return
     if kind == "touch":
         touch = json.loads(message.payload)
@@ -129,7 +140,7 @@ def take(message: mqtt.MQTTMessage, parts: dict[str, Part]) -> None:
 
 def watch() -> None:
     """Print what is received until the broker does not want us."""
-    parts: dict[str, Part] = defaultdict(Part)
+    parts = Parts()
     while True:
         try:
             seen = inbox.get(timeout=STALE_S / 10)

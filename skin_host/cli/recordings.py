@@ -192,15 +192,17 @@ def _calibration(
     """Return the calibration with which a recording is processed; print what is in doubt of it."""
     from skin_host.recording.replay import calibration_for, doubts
 
-    def warn_of(doubt: str) -> None:
-        warn(f"{log}: {doubt}")
-
+    warn_of = partial(_warn_of, log)
     found = calibration_for(
         log, settings, layout, arguments.calibration, arguments.calibrate_seconds, warn_of
     )
     for doubt in doubts(found, settings, layout):
         warn_of(doubt)
     return found
+
+
+def _warn_of(log: Path, doubt: str) -> None:
+    warn(f"{log}: {doubt}")
 
 
 def _needs_config(recording: Path) -> RequestError:
@@ -327,7 +329,8 @@ def _series(arguments: argparse.Namespace) -> "Series":
         return read_messages(arguments.recording)
     settings, layout = load_skin(arguments.config)
     found = _calibration(arguments, arguments.recording, settings, layout)
-    return read_frames(arguments.recording, settings, layout, found)
+    warn_of = partial(_warn_of, arguments.recording)
+    return read_frames(arguments.recording, settings, layout, found, warn_of)
 
 
 def _export(arguments: argparse.Namespace) -> int:
@@ -427,6 +430,7 @@ async def _play_processed(arguments: argparse.Namespace) -> int:
     from skin_host.mqtt.address import Broker
     from skin_host.processing.core import Engine
     from skin_host.recording.playback import play_processed, played_as, refuse_live
+    from skin_host.recording.replay import slow_boards
 
     settings, layout = load_skin(arguments.config)
     broker, base = Broker.from_url(arguments.broker, settings.mqtt.protocol)
@@ -445,6 +449,8 @@ async def _play_processed(arguments: argparse.Namespace) -> int:
         f"{played.frames} frames played; delivered: {played.frames_sent} frames, "
         f"{played.events_sent} touch events"
     )
+    if slow := slow_boards(engine):
+        _warn_of(arguments.log, slow)
     return 0
 
 

@@ -95,7 +95,7 @@ def add_commands(commands: Commands) -> None:
         type=Path,
         default=Path("recordings"),
         metavar="FOLDER",
-        help="for what is recorded from the page (recordings)",
+        help="for what is recorded from the page",
     )
     others = ["--foxglove", "--rerun"]
     add_rules(view, idle_with={"--name": others, "--read-only": others, "--recordings": others})

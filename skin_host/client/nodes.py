@@ -5,10 +5,11 @@ takes times.
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 
 from skin_host.client.heard import Described
 from skin_host.client.presence import Presence
-from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
+from skin_host.mqtt.info import NodeInfo, PartInfo, decode_info, join_pieces
 from skin_host.mqtt.order import Stamp
 from skin_host.mqtt.payload import MessageError
 
@@ -16,6 +17,10 @@ from skin_host.mqtt.payload import MessageError
 MAX_NAMES = 256
 #: Of the infos of all its nodes; an iCub's has 0.4 MB.
 MAX_INFO_BYTES = 32 * 1024 * 1024
+#: No part is wider, and no pad: beside one, other parts on a map would be too small to be seen.
+MAX_WIDE_M = 10.0
+#: As far from its origin as a configuration may place one.
+MAX_PLACE_M = 1000.0
 
 
 @dataclass
@@ -89,7 +94,8 @@ class Nodes:
         """Take a piece of the info of a node; an empty one was deleted.
 
         Raises:
-            MessageError: it cannot be read, or the infos of all nodes are too long.
+            MessageError: it cannot be read, describes a part that no robot has, or the infos of
+                all nodes are too long.
         """
         node = self.known.setdefault(name, Node())
         self._info_bytes -= node.sizes.pop(piece, 0)
@@ -97,7 +103,10 @@ class Nodes:
         if payload:
             if self._info_bytes + len(payload) > MAX_INFO_BYTES:
                 raise MessageError(f"info: more than {MAX_INFO_BYTES} bytes of one robot")
-            node.pieces[piece] = decode_info(payload)
+            info = decode_info(payload)
+            for part, described in info.parts.items():
+                _check_size(part, described)
+            node.pieces[piece] = info
             node.sizes[piece] = len(payload)
             self._info_bytes += len(payload)
         node.info = join_pieces(node.pieces)
@@ -160,3 +169,26 @@ class Nodes:
             else:
                 continue
             yield described
+
+
+def _check_size(name: str, part: PartInfo) -> None:
+    """Refuse a part of a size that none of a robot has.
+
+    Raises:
+        MessageError: it is too wide, too far from its origin, or one of its pads is too large.
+    """
+    places = chain(part.position_m, *(triangle.outline_m for triangle in part.triangles))
+    far_m = wide_m = 0.0
+    for along_m in zip(*places, strict=True):
+        least_m, most_m = min(along_m), max(along_m)
+        far_m = max(far_m, most_m, -least_m)
+        wide_m = max(wide_m, most_m - least_m)
+    for size_m, limit_m, what in (
+        (far_m, MAX_PLACE_M, "from its origin"),
+        (wide_m, MAX_WIDE_M, "wide"),
+        (max(part.radius_mm, default=0.0) * 1e-3, MAX_WIDE_M, "is the radius of a pad"),
+    ):
+        if size_m > limit_m:
+            raise MessageError(
+                f"info: parts.{name}: {size_m:g} m {what}; wanted at most {limit_m:g} m"
+            )

@@ -274,16 +274,18 @@ def calibrate_from_log(
             f"({sum(one.unknown_board for one in counters)} of other boards); wanted a recording "
             "made with this CONFIG, see `skin check CONFIG`"
         )
-    if not engine.calibration_progress() and (slow := _slow_boards(engine)):
+    if not engine.calibration_progress() and (slow := slow_boards(engine)):
         raise LogError(f"{log}: {slow}")
     # A recording's calibration carries the recording's time, so that replays stay equal.
     time = datetime.fromtimestamp(last_ns / 1e9, UTC).isoformat(timespec="seconds")
     return engine.end_calibration(time)
 
 
-def _slow_boards(engine: Engine) -> str:
-    """Return in words which boards regularly send so slowly that each sweep ends a silence; empty:
-    none.
+def slow_boards(engine: Engine) -> str:
+    """Return in words which boards of a recording regularly send so slowly that each sweep ends a
+    silence; empty: none.
+
+    The engine has processed it: until then nothing is known of its boards.
     """
     found = []
     for board in engine.boards:
@@ -493,7 +495,7 @@ def process(
     else:
         with whole_file(task.output) as growing, growing.open("wb") as output:
             number = write_lines(task.log, engine, output, progress)
-    if slow := _slow_boards(engine):
+    if slow := slow_boards(engine):
         warn(slow)
     return number
 

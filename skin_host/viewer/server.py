@@ -40,6 +40,9 @@ NODES_S = 0.25
 #: A broker that cannot be reached is tried again after this time.
 RETRY_S = 2.0
 MAX_PAGES = 32
+#: A page that has not taken its new messages after this time is closed, and connects again when it
+#: can. A ping would not end it: it waits behind them.
+TAKEN_S = 60.0
 MAX_REQUEST_BYTES = 4096
 #: A page sends each request as one; pieces without bytes could go on for ever.
 MAX_PIECES = 16
@@ -235,8 +238,13 @@ class Viewer:
         due_s = _now_s()
         while True:
             # Sending waits for a slow page; frames that arrive meanwhile are skipped.
-            for message in self._picture.news(cursor, _now_s()):
-                await page.send(message)
+            try:
+                async with asyncio.timeout(TAKEN_S):
+                    for message in self._picture.news(cursor, _now_s()):
+                        await page.send(message)
+            except TimeoutError:
+                page.transport.abort()
+                return
             due_s = max(due_s + TICK_S, _now_s())
             await asyncio.sleep(due_s - _now_s())
 

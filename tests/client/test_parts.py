@@ -12,11 +12,13 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skin_host.client import Contact, Described, RequestError, SkinCallbacks
+from skin_host.client.nodes import Nodes
 from skin_host.client.presence import Presence
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
-from skin_host.mqtt.info import NodeInfo, encode_info, node_info
+from skin_host.mqtt.info import NodeInfo, PartInfo, encode_info, node_info
 from skin_host.mqtt.order import Stamp
+from skin_host.mqtt.payload import MessageError
 from tests.client.test_client import CONFIG, hearing, publishing, take
 from tests.support.broker import Mosquitto
 from tests.support.waiting import PATIENCE_S, until
@@ -28,6 +30,56 @@ ELSEWHERE = replace(HAND, position_m=[(0.5, y, z) for _, y, z in HAND.position_m
 
 def described_by(node: str, **parts: Any) -> NodeInfo:
     return replace(INFO, node=node, parts=parts)
+
+
+#: Of a part that is wider than any robot's.
+FAR = (900.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("part", "what"),
+    [
+        (replace(HAND, position_m=[FAR, *HAND.position_m[1:]]), r"900[.0-9]* m wide"),
+        (
+            replace(HAND, triangles=[replace(HAND.triangles[0], outline_m=[FAR, (0.0, 0.0, 0.0)])]),
+            r"900[.0-9]* m wide",
+        ),
+        (replace(HAND, position_m=[(0.0, -1e300, 0.0)] * len(HAND.pads)), r"1e\+300 m from its"),
+        (replace(HAND, radius_mm=[1e6] * len(HAND.pads)), "1000 m is the radius of a pad"),
+    ],
+)
+def test_an_info_with_a_part_larger_than_any_robots_is_refused(part: PartInfo, what: str) -> None:
+    """On a map of one scale nothing else would be seen."""
+    nodes = Nodes(Presence(stale_s=3.0))
+    nodes.take_info("main", 1, encode_info(INFO), None, 0.0)
+    with pytest.raises(MessageError, match=f"^info: parts.left_hand: {what}"):
+        nodes.take_info("other", 1, encode_info(described_by("other", left_hand=part)), None, 1.0)
+    assert nodes.known["other"].info is None
+    assert nodes.parts()["left_hand"] == Described("left_hand", "main", HAND)
+
+
+def test_a_part_far_from_its_origin_is_taken() -> None:
+    nodes = Nodes(Presence(stale_s=3.0))
+    far = replace(
+        HAND,
+        position_m=[(x + 900, y, z) for x, y, z in HAND.position_m],
+        triangles=[replace(triangle, outline_m=[FAR]) for triangle in HAND.triangles],
+    )
+    nodes.take_info("main", 1, encode_info(described_by("main", left_hand=far)), None, 0.0)
+    assert nodes.parts()["left_hand"].info == far
+
+
+async def test_one_among_the_messages_is_counted(mosquitto: Mosquitto) -> None:
+    wide = replace(HAND, position_m=[FAR, *HAND.position_m[1:]])
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        publisher.put_info(INFO)
+        await skin.ready()
+        await until(lambda: "left_hand" in skin.parts())
+        async with aiomqtt.Client(mosquitto.host, mosquitto.port) as somebody:
+            payload = encode_info(described_by("other", wide=wide))
+            await somebody.publish("skin/robot/nodes/other/info", payload, qos=1)
+        await until(lambda: skin.unreadable == 1)
+        assert set(skin.parts()) == {"left_hand", "left_forearm"}
 
 
 @pytest.mark.parametrize("order", [*itertools.permutations(["main", "main-1", "main-2"])])

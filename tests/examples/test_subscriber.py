@@ -208,6 +208,22 @@ async def test_what_is_no_message_of_a_skin_is_passed_over(mosquitto: Mosquitto)
         assert all(line.isprintable() for line in lines)
 
 
+async def test_names_without_end_are_not_kept(mosquitto: Mosquitto) -> None:
+    async with robot(mosquitto) as demo, running(mosquitto) as program:
+        await demo.touch(1)
+        assert f"{NAME} begin 7 2.00 N" in await program.lines_to_marker(demo)
+        for number in range(1100):
+            await demo.put(f"skin/demo/part{number}/contact", b"OFF", stamp="5.1")
+        lines = await program.lines_to_marker(demo)
+        assert len({line for line in lines if line.endswith(" OFF")}) == 1000 - 2
+        # Of those that it knows nothing is passed over.
+        names = "part1099,part1098,left_hand"
+        await demo.put(f"{HAND}/contact", b"OFF", stamp="5.2")
+        await demo.put("skin/demo/nodes/main/status", b"offline", parts=names)
+        lines = await program.lines_to_marker(demo)
+        assert [line for line in lines if NAME in line] == [f"{NAME} OFF", f"{NAME} UNKNOWN"]
+
+
 async def test_a_broker_that_refuses_it_ends_it_with_one_line(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:

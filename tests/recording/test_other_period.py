@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from skin_host.cli import main
+from tests.support.broker import Mosquitto
 from tests.support.limbs import calibrate, ramp, write_config, write_log
 
 
@@ -43,3 +44,37 @@ def test_a_recording_of_which_little_counts_for_that_is_processed_with_a_warning
     assert ("wanted boards.NAME.period_ms as in the recording" in error) == is_slow
     last_frame = [line for line in output.read_text().splitlines() if '"frame"' in line][-1]
     assert any(json.loads(last_frame)["valid"]) != is_slow
+
+
+@pytest.mark.parametrize(("period_ms", "is_slow"), [(40, True), (60, False)])
+def test_what_is_exported_and_drawn_of_it_comes_with_the_same_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], period_ms: int, is_slow: bool
+) -> None:
+    bench = write_config(tmp_path)
+    bench.write_text(bench.read_text().replace("period_ms = 200", f"period_ms = {period_ms}"))
+    log = write_log(tmp_path / "slow.log", ramp(bench)[0])
+    tables, picture = tmp_path / "slow.npz", tmp_path / "slow.png"
+    for words in (
+        ("replay", log, "--config", bench, "--output", tmp_path / "slow.jsonl"),
+        ("export", log, tables, "--config", bench),
+        ("plot", "pressure", log, picture, "--config", bench, "--part", "arm"),
+    ):
+        assert main([str(word) for word in words]) == 0
+        slow = [line for line in capsys.readouterr().err.splitlines() if " sends every " in line]
+        assert len(slow) == is_slow
+        assert all(
+            line.startswith(f"warning: {log}: a sends every 200 ms (configured: 40 ms)")
+            for line in slow
+        )
+
+
+def test_what_is_played_of_it_to_a_broker_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], mosquitto: Mosquitto
+) -> None:
+    bench = write_config(tmp_path)
+    bench.write_text(bench.read_text().replace("period_ms = 200", "period_ms = 40"))
+    log = write_log(tmp_path / "slow.log", ramp(bench)[0])
+    words = "replay", log, "--config", bench, "--onto", "broker", "--speed", 1000
+    url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    assert main([*(str(word) for word in words), "--broker", url]) == 0
+    assert "a sends every 200 ms (configured: 40 ms)" in capsys.readouterr().err

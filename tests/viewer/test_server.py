@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from msgspec.structs import replace
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 
@@ -425,6 +426,38 @@ async def test_nonsense_from_a_page_is_answered(nonsense: str | bytes) -> None:
     async with Viewer(nowhere(), robot="demo").serving(port=0) as url, page(url) as socket:
         await socket.send(nonsense)
         assert not (await heard(socket, of_type("answer")))["ok"]
+
+
+async def test_a_page_that_takes_nothing_gives_its_place_to_another(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What the kernel takes for it is soon full: then no ping leaves either, which would end it."""
+    info = node_info(skin(), "main", version="1", configuration="x")
+    hand = info.parts["left_hand"]
+    pads = 100_000
+    large = replace(
+        hand,
+        pads=["pressure"] * pads,
+        position_m=[(0.123456, 0.123456, 0.123456)] * pads,
+        normal=[(0.0, 0.0, 1.0)] * pads,
+        radius_mm=[2.0] * pads,
+        area_mm2=[10.0] * pads,
+    )
+    viewer = Viewer(nowhere(), robot="demo")
+    viewer._picture.take_nodes(
+        "demo", {"main": (True, replace(info, parts={"left_hand": large}))}, {"left_hand": "main"}
+    )
+    monkeypatch.setattr(server, "MAX_PAGES", 1)
+    monkeypatch.setattr(server, "TAKEN_S", 0.1)
+    async with viewer.serving(port=0) as url, page(url, ping_interval=None) as socket:
+        socket.transport.pause_reading()
+        await until(lambda: viewer._pages == 0)
+        socket.transport.abort()
+        monkeypatch.undo()
+        monkeypatch.setattr(server, "MAX_PAGES", 1)
+        async with page(url) as other:
+            await heard(other, of_type("layout"))
+    assert not [one for one in caplog.messages if "page" in one]
 
 
 async def test_a_broker_that_comes_late_is_found(mosquitto: Mosquitto) -> None:

@@ -35,7 +35,7 @@ from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.export.columns import TABLES
 from skin_host.recording.export.known import CONTACT_STALE_S, ContactLine, Gone, Known
 from skin_host.recording.mcap import read_messages_of, robot_at
-from skin_host.recording.replay import contacts_of, replay
+from skin_host.recording.replay import contacts_of, replay, slow_boards
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -235,9 +235,18 @@ def health_line(part: str, t_ns: int, record: Mapping[str, Any]) -> HealthLine:
     return HealthLine(part, t_ns, state, "; ".join([f"{part}: {state}", *map(str, sentences)]))
 
 
-def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Calibration) -> Series:
+def read_frames(
+    log: Path,
+    settings: Settings,
+    layout: Layout,
+    calibration: Calibration,
+    warn: Callable[[str], None] = lambda _: None,
+) -> Series:
     """Process a recording of CAN frames with the pipeline, as `skin replay` does. It may have no
     frames of pressure, see `Series.require_frames`.
+
+    `warn` is called with the boards of which little or nothing counted because they send much more
+    slowly than configured.
 
     Raises:
         LogError: it cannot be read, or holds nothing of this skin.
@@ -288,4 +297,6 @@ def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Cali
         records = FingertipHealth(engine.fingertips).records(None)
         found.health.extend(health_line(name, last_ns, record) for name, record in records.items())
     found.health.sort(key=lambda line: line.t_ns)
+    if slow := slow_boards(engine):
+        warn(slow)
     return found
