@@ -101,7 +101,7 @@ class Clock:
         """Run a blocking function, for a disk or a resolver, beside the event loop.
 
         Unlike with `asyncio.to_thread`, the end of the program does not wait for it: a cancelled
-        caller leaves the thread running.
+        caller leaves the thread running. Where the system lets no thread begin, the loop waits.
 
         Raises:
             Exception: what the function raises.
@@ -129,7 +129,10 @@ class Clock:
                 return  # the loop has ended meanwhile
 
         name = getattr(function, "__name__", "work")
-        threading.Thread(target=run, name=name, daemon=True).start()
+        try:
+            threading.Thread(target=run, name=name, daemon=True).start()
+        except RuntimeError:  # a limit of tasks or of memory; what keeps files must not end by it
+            run()
         return await done
 
     def executor(self, name: str) -> "Executor":

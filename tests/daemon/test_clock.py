@@ -1,6 +1,7 @@
 """Stepped time: a loop that never waits, whose timers go off in order and on time."""
 
 import asyncio
+import threading
 import time
 
 import pytest
@@ -93,6 +94,20 @@ async def test_what_may_block_is_done_without_a_thread(clock: SteppedClock) -> N
     assert isinstance(executor.submit(int, "x").exception(0), ValueError)
     loop = asyncio.get_running_loop()
     assert await loop.run_in_executor(None, int, "9") == 9
+
+
+async def test_where_no_thread_may_begin_the_loop_does_what_may_block(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As in a service whose limit of tasks is reached, which must go on keeping its files."""
+
+    def refuse(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    with pytest.raises(ZeroDivisionError):
+        await SYSTEM.in_thread(lambda: 1 // 0)
+    assert await SYSTEM.in_thread(int, "7") == 7
 
 
 async def test_the_machines_clock_does_the_same_with_threads() -> None:
