@@ -369,8 +369,8 @@ def _taxels(record: Record) -> Iterator[FoundFault]:
             yield fault(f"taxel_{kind}", taxels, what)
     verdicts = record["taxel_verdicts"]
     if noisy := verdicts.get("noisy"):
-        what = f"up to {record['decides_kpa']:g} kPa to decide within a second"
-        yield fault("taxel_decides_late", noisy, f"noisy when calibrated; they need {what}")
+        what = f"a decision within a second takes up to {record['decides_kpa']:g} kPa"
+        yield fault("taxel_decides_late", noisy, f"noisy when calibrated; {what}")
     if saturated := verdicts.get("saturates"):
         yield fault(
             "taxel_saturates",
