@@ -44,7 +44,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.config.settings import Drift
+from skin_host.processing.loaded_zeros import FALLEN_UNITS, LoadedZeros
 from skin_host.processing.masks import Mask
+from skin_host.processing.thermal import SMOOTHING_S, ThermalReference
 
 Array = NDArray[np.float64]
 
@@ -64,19 +66,10 @@ QUICK_UNITS_PER_S = 0.4
 SLOW_UNITS_PER_S = 0.01
 #: A bulge of any depth that lasts for ten minutes does not become a touch.
 ALONE_UNITS_PER_S = 0.0005
-#: Normal drift never goes this far below the baseline: the skin bulges, or was loaded before.
-FALLEN_UNITS = -2.5
-#: So many taxels may bulge beside each that is touched.
-BULGED = 10
-#: By so many deviations of single readings noise takes the lowest of some means below the level,
-#: even where it jumps between two levels.
-LOWEST_DEVIATIONS = 1.5
 #: Bulges without a touch are shorter, and so are the pauses of a flickering touch.
 SETTLE_S = 5.0
 #: A taxel recovers until the stored time in touch has faded to this.
 RECOVERED_S = 1.0
-#: Slow changes are detected in means over this time, because a byte resolves them poorly.
-SMOOTHING_S = 10.0
 #: Such means differ by no more without a change: five times their noise on good pads.
 SMOOTH_TOLERANCE_UNITS = 0.25
 #: A load that suddenly falls below this share of its value is eased.
@@ -100,12 +93,6 @@ UNCERTAIN_UNITS = 2.0
 #: So is one, after this time, of a taxel that has been touched ever since it came into use: no
 #: reading has shown yet that it is right. After a night it may not be.
 UNSHOWN_S = 60.0
-#: What has returned has fallen again when it reads less than this share of what it fell by.
-LIFTED_SHARE = 0.5
-#: For this long a baseline may return after a fall, and thermal evidence lasts.
-MEMORY_S = 3600.0
-#: Thermal evidence, in units^2 s, that weighs as much as the assumption of no relation.
-THERMAL_PRIOR = 100.0
 
 
 class State(IntEnum):
@@ -158,8 +145,6 @@ class BaselineTracker:
             they are released, as they have not yet.
         is_released: whether most of the taxels that were pressed of late are free, which shows that
             what pressed the part has gone.
-        returned: bool[n], taxels that read what their baseline was before it fell: they are pressed
-            again, or it has returned. The array changes only by being replaced.
     """
 
     def __init__(
@@ -176,9 +161,9 @@ class BaselineTracker:
         self.shared_units: Array | float = 0.0
         self.owed_units: Array | float = 0.0
         self.is_released = False
-        self.returned: Mask = np.zeros(n, np.bool_)
+        self._loads = LoadedZeros(n)
         self._configure(usable, settings)
-        self._thermal = _ThermalReference(triangle, thermal) if np.any(thermal) else None
+        self._thermal = ThermalReference(triangle, thermal) if np.any(thermal) else None
         #: Whether something may press on the whole part without any of its taxels being touched
         #: yet.
         self._loaded = False
@@ -186,11 +171,7 @@ class BaselineTracker:
         self._behind = False
         #: Whether any taxel is not idle.
         self._unsettled = False
-        #: For how long it yet counts that each taxel read below its zero as most of the part did.
-        self._below_s: Array = np.zeros(n)
         self._fallen_s: Array = np.zeros(n)
-        self._former: Array = np.zeros(n)
-        self._former_s: Array = np.zeros(n)
         self._last: Array = np.zeros(n)
         #: How far each reading is from what the untouched ones have in common, over as many windows
         #: as `CONVERSIONS` take.
@@ -258,13 +239,14 @@ class BaselineTracker:
             units = units - forecast
             self._note_drift(forecast)
 
-        received = int(np.count_nonzero(self._usable & ~missing))
+        received = self._usable & ~missing
         shows = free & ~recovering
         low, noise = (units, 0.0) if lowest is None else lowest
         low = low + relaxed_units
-        lifted = self._lifted(low, noise, touched, missing, received, dt_s)
+        lifted = self._loads.lifted(low, noise, touched, received, dt_s)
         share = _share(conversions)
-        common = self._common(units, shows, received, np.where(shows | missing, share, 1.0), dt_s)
+        share = np.where(shows | missing, share, 1.0)
+        common = self._common(units, shows, int(np.count_nonzero(received)), share, dt_s)
         self.shared_units = common if forecast is None else common + forecast
         if lifted is None and self._is_calm(units, common, hidden, dt_s):
             change = self._own(units - common, self._settings.rate_units_per_s * dt_s, dt_s)
@@ -278,7 +260,7 @@ class BaselineTracker:
         change[fallen] = units[fallen]
         if lifted is not None:
             fallen = fallen | lifted
-        self._expect_back(fallen if common > FALLEN_UNITS else free | fallen)
+        self._loads.expect_back(fallen if common > FALLEN_UNITS else free | fallen, self.baseline)
         if abs(common) <= QUICK_UNITS_PER_S * dt_s:
             self._note_drift(common)
 
@@ -294,11 +276,11 @@ class BaselineTracker:
         change += self._given_back(units, level, touched, released | ended, dt_s)
         if lifted is not None:
             change[lifted] = low[lifted]
-        self._note_returns(level, still, missing, dt_s)
+        self._loads.note_returns(level, self.baseline, still, missing, dt_s)
         self._move(change, common, forecast)
         self._unsettled = self._touches.fading or bool(
             np.count_nonzero(self._fallen_s)
-            or np.count_nonzero(self._former_s > 0.0)
+            or self._loads.may_return
             or np.count_nonzero(self._taken_s > 0.0)
             or np.count_nonzero(self._loaded_s > 0.0)
         )
@@ -316,12 +298,11 @@ class BaselineTracker:
         np.copyto(self.calibrated, self.baseline, where=taxels)
         self._configure(self._usable, self._settings)
         touched_s = self._touches.touched_s
-        memories = (self._fallen_s, self._former_s, self._taken_s, self._loaded_s)
-        for memory in (*memories, self._below_s, touched_s):
+        for memory in (self._fallen_s, self._taken_s, self._loaded_s, touched_s):
             memory[taxels] = 0.0
+        self._loads.forget(taxels)
         self._apart[taxels] = 0.0
         self._shown[taxels] = False
-        self.returned = self.returned & ~taxels
         if self._thermal is not None:
             self._thermal.forget(taxels)
 
@@ -331,7 +312,7 @@ class BaselineTracker:
         if settings.rule == "none":
             # Nothing moves that a touch could hold, and nothing would end what is known of touches.
             self._touches = _Touches(len(zeroed))
-            self.returned = np.zeros(len(zeroed), np.bool_)
+            self._loads = LoadedZeros(len(zeroed))
         self.forget(zeroed)
 
     def _configure(self, usable: Mask, settings: Drift) -> None:
@@ -346,6 +327,13 @@ class BaselineTracker:
             State.RECOVERING: settings.rate_units_per_s,
         }
         self._own_rate = np.array([rates[state] for state in State])
+
+    @property
+    def returned(self) -> Mask:
+        """Return taxels [n] that read what their baseline was before it fell: they are pressed
+        again, or it has returned. The array changes only by being replaced.
+        """
+        return self._loads.returned
 
     @property
     def frozen(self) -> Mask:
@@ -409,33 +397,6 @@ class BaselineTracker:
             or np.count_nonzero((units < FALLEN_UNITS) & self._usable)
         )
 
-    def _lifted(
-        self,
-        low: Array,
-        noise: Array | float,
-        touched: Mask,
-        missing: Mask,
-        received: int,
-        dt_s: float,
-    ) -> Mask | None:
-        """Return from which taxels [n] a load has lifted that pressed most of the part when its
-        zeros were taken, or None: in two windows most of it has read below its zeros.
-
-        Args:
-            low: lowest reading [n] of each, relaxation included: no model of the foam makes it so.
-            noise: of single readings [n].
-            touched, missing, dt_s: see `step`; received: see `_common`.
-        """
-        below = (low < FALLEN_UNITS) & self._usable & ~missing
-        surely = below & (low + LOWEST_DEVIATIONS * noise < FALLEN_UNITS)
-        bulged = BULGED * np.count_nonzero(touched & ~below)
-        if 2 * np.count_nonzero(surely) <= received or np.count_nonzero(surely) <= bulged:
-            self._below_s -= dt_s
-            return None
-        lifted = below & (self._below_s > 0.0)
-        self._below_s = np.where(below, SETTLE_S, self._below_s - dt_s)
-        return lifted if np.count_nonzero(lifted) else None
-
     def _move(self, change: Array, common: float, forecast: Array | None) -> None:
         """Move the baselines, within their limits, by `common` and what each moves beyond it."""
         self._apart -= change - common
@@ -459,7 +420,7 @@ class BaselineTracker:
 
     def _note_drift(self, change: Array | float) -> None:
         """All readings have changed by this: those from before would be others now."""
-        self._former += change
+        self._loads.note_drift(change)
         self._before += change
         self._taken_free += change
         self._taken_level += change
@@ -544,27 +505,6 @@ class BaselineTracker:
         np.fmin(change, limit, out=change)
         np.fmax(change, np.negative(limit), out=change)
         return change
-
-    def _expect_back(self, fallen: Mask) -> None:
-        """Store the baselines of some taxels before they follow a fall."""
-        new = fallen & (self._former_s <= 0.0)
-        if np.count_nonzero(new):
-            self._former[new] = self.baseline[new]
-            self._former_s[new] = MEMORY_S
-
-    def _note_returns(self, level: Array, still: Mask, missing: Mask, dt_s: float) -> None:
-        """Note which taxels [n] read again as they did before a fall, until they fall again.
-
-        Then something had pressed them, and their baseline is right as it is.
-        """
-        self._former_s -= np.where(self.returned, 0.0, dt_s)
-        rise = self._former - self.baseline
-        near = np.abs(level - self._former) < 2.0 * TOLERANCE_UNITS
-        new = still & (self._former_s > 0.0) & (rise > -FALLEN_UNITS) & near & ~self.returned
-        lifted = self.returned & ~missing & (level - self.baseline < LIFTED_SHARE * rise)
-        self._former_s[lifted] = 0.0
-        if np.count_nonzero(new) or np.count_nonzero(lifted):
-            self.returned = (self.returned | new) & ~lifted
 
 
 class _Touches:
@@ -701,60 +641,3 @@ def _median(values: Array) -> float:
     """Return the upper median; numpy's own takes five times as long for so few values."""
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])
-
-
-class _ThermalReference:
-    """The drift of each taxel since the last step, as far as the temperature pads predict it."""
-
-    def __init__(self, triangle: NDArray[np.int32], thermal: Mask) -> None:
-        n = len(triangle)
-        self._triangle = triangle = np.unique(triangle, return_inverse=True)[1].astype(np.intp)
-        self._pads = np.flatnonzero(thermal)
-        self._pads_of = np.bincount(triangle[self._pads], minlength=int(triangle.max()) + 1)
-        #: Of the triangle of each taxel, smoothed; NaN while it is not known.
-        self._temperature: Array = np.full(n, np.nan)
-        #: Sums over time while untouched: 1, temperature, reading, and their products.
-        self._sums: Array = np.zeros((5, n))
-
-    def forget(self, taxels: Mask) -> None:
-        """Some taxels, bool[n], have a new zero, and so have the temperature pads beside them."""
-        beside = np.zeros(len(self._pads_of), np.bool_)
-        beside[self._triangle[taxels]] = True
-        anew = beside[self._triangle]
-        self._temperature[anew] = np.nan
-        self._sums[:, anew] = 0.0
-
-    def step(self, units: Array, baseline: Array, free: Mask, missing: Mask, dt_s: float) -> Array:
-        """Return the predicted change [n] of the baselines; learn from the untouched taxels.
-
-        The temperature stays as it was where a pad that measures it is missing.
-        """
-        pads, triangles = self._pads, len(self._pads_of)
-        sums = np.bincount(self._triangle[pads], units[pads], minlength=triangles)
-        now = (sums / np.maximum(self._pads_of, 1))[self._triangle]
-        absent = np.bincount(self._triangle[pads], missing[pads], minlength=triangles) > 0
-        known = ~absent[self._triangle]
-        new = known & np.isnan(self._temperature)
-        self._temperature[new] = now[new]
-        known &= ~new
-        share = -math.expm1(-dt_s / SMOOTHING_S)
-        change = np.where(known, share * (now - self._temperature), 0.0)
-        temperature = self._temperature = self._temperature + change
-        reading = baseline + units
-        new_sums = np.array(
-            [
-                np.ones(len(free)),
-                temperature,
-                reading,
-                temperature * reading,
-                temperature * temperature,
-            ]
-        )
-        kept = math.exp(-dt_s / MEMORY_S)
-        np.copyto(self._sums, kept * self._sums + dt_s * new_sums, where=free & known)
-        # Least squares: how much each untouched taxel follows the temperature.
-        time_s, warm, read, cross, square = self._sums
-        time_s = np.maximum(time_s, dt_s)
-        slope = (cross - warm * read / time_s) / (square - warm**2 / time_s + THERMAL_PRIOR)
-        forecast: Array = slope * change
-        return forecast
