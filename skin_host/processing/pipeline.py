@@ -587,6 +587,7 @@ class _PartPipeline:
         self._rows[:, taxels] = 0.0
         for window in (self._piece, self._drifting, self._relaxing):
             window.sum_kpa[taxels] = 0.0
+            window.lowest_kpa[taxels] = np.inf
         self._was_touched[taxels] = False
         self._noted = self._nowhere
 

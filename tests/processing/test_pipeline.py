@@ -407,6 +407,18 @@ def test_what_stood_on_the_skin_when_it_was_calibrated_is_felt_after_some_steps(
     assert np.median(frames[-1].pressure_kpa[rig.n // 2 :] / right) == pytest.approx(1.0, abs=0.1)
 
 
+def test_what_read_low_by_another_zero_shows_no_load_in_the_new_one():
+    rig = Rig(1, 0.3)
+    low = np.linspace(-12.0, -4.0, rig.n)
+    press(rig, 0.0, 50, slice(None))
+    press(rig, low, 15, slice(None))
+    rig.pipeline.set_zero(np.arange(rig.n, dtype=np.int32), rig.true_baseline)
+    press(rig, 0.0, 60, slice(None))
+    press(rig, low, 15, slice(None))
+    assert press(rig, 0.0, 60, slice(None))[-1].valid.all()
+    assert np.abs(rig.pipeline.baseline - rig.true_baseline).max() < 1.0
+
+
 def test_a_flickering_taxel_disturbs_no_other():
     rig = Rig(1, 0.3)
     rng = np.random.default_rng(2)
