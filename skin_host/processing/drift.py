@@ -19,8 +19,7 @@ What the readings can distinguish, and what they cannot:
 
 - A load only raises a reading, so a fall of all taxels alike is drift or a release, at any
   rate. An even load of the whole part that rises slowly reads like drift, and is taken for it.
-- A load that presses most of a part while its zeros are taken is in them. When it lifts, most of
-  the part reads below its zeros, even if only between steps: they are followed at once.
+- A load may press while a zero is taken, and be in it: see `loaded_zeros`.
 - A touch makes the skin around it bulge: untouched taxels read several units less while it
   lasts. If they were followed, they would read as touched afterwards.
 - A hand warms what it holds, within minutes. A slow rise of a touched taxel is taken for that;
@@ -33,8 +32,6 @@ What the readings can distinguish, and what they cannot:
   foam pushes back: it is not followed, and what was taken for drift since the touch ended is given
   back.
 - What remains of a released contact is no touch: nothing latches.
-- What returns to where its baseline was before a fall is pressed again as it was when its zero was
-  taken, or was pulled and is free. It is not valid until it falls again, which shows the first.
 """
 
 import math

@@ -1,11 +1,9 @@
 """Zeros of taxels that go astray over minutes are told, with what to do about them."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from emulator.probes.scene import Air, Fault, Scene, load
+from emulator.probes.scene import Air, Fault, Place, Probe, Scene
 from skin_host.bus.compensation import thermal_gains
 from skin_host.health.describe import Describer
 from skin_host.health.diagnosis import diagnose
@@ -13,32 +11,17 @@ from skin_host.layout import PadKind
 from skin_host.processing.calibration import with_gains
 from tests.support.fault_bench import CONFIG, FaultBench
 
-HELD_SCENE = """
-about = "Something is put on the forearm and stays."
-spread = false
 
-[[probe]]
-part = "left_forearm"
-at = { taxel = 27 }
-diameter_mm = 3
-pressure_kpa = [[0, 0], [0.2, 100], [600, 100]]
-start_s = 12
-"""
-
-BACK_SCENE = """
-about = "Something lies on the forearm while it is calibrated, is lifted, put back, and so on."
-spread = false
-
-[[probe]]
-part = "left_forearm"
-at = { taxel = 27 }
-diameter_mm = 12
-pressure_kpa = [
-    [0, 0], [0.2, 60], [30, 60], [30.2, 0], [45, 0],
-    [45.2, 60], [60, 60], [60.2, 0], [75, 0], [75.2, 60], [90, 60],
-]
-start_s = 7
-"""
+def pressing(diameter_mm: float, start_s: float, *pressure_kpa: tuple[float, float]) -> Scene:
+    """Something presses the forearm by so much, kPa, from so long after its start on."""
+    probe = Probe(
+        "left_forearm",
+        Place(taxel=27),
+        diameter_mm=diameter_mm,
+        pressure_kpa=[*pressure_kpa],
+        start_s=start_s,
+    )
+    return Scene(spread=False, probe=[probe])
 
 
 def codes(bench: FaultBench, part: str) -> set[str]:
@@ -74,10 +57,8 @@ def test_a_zero_that_drifts_is_told_and_told_again_when_it_can_follow_no_farther
     assert "calibrate" in says
 
 
-def test_a_touch_that_never_ends_hides_a_zero_and_that_is_told(tmp_path: Path) -> None:
-    scene = tmp_path / "held.toml"
-    scene.write_text(HELD_SCENE)
-    bench = FaultBench(scene=load(scene))
+def test_a_touch_that_never_ends_hides_a_zero_and_that_is_told() -> None:
+    bench = FaultBench(scene=pressing(3.0, 12.0, (0.0, 0.0), (0.2, 100.0), (600.0, 100.0)))
     bench.reload({"processing.drift.frozen_report_s": 4.0})
     while bench.t_s < 14.0:
         bench.run(0.5)
@@ -90,15 +71,18 @@ def test_a_touch_that_never_ends_hides_a_zero_and_that_is_told(tmp_path: Path) -
     assert bench.valid["left_forearm"][27]
 
 
-def test_what_a_load_of_the_calibration_presses_again_is_in_doubt_until_it_is_lifted(
-    tmp_path: Path,
-) -> None:
+def test_what_a_load_of_the_calibration_presses_again_is_in_doubt_until_it_is_lifted() -> None:
     """The zero followed when it was lifted. What reads as high as before may be that load, or a pad
     that was pulled and is free: the first time no reading shows which.
     """
-    scene = tmp_path / "back.toml"
-    scene.write_text(BACK_SCENE)
-    bench = FaultBench(3.0, scene=load(scene), settle_s=3.0)
+    # 60 kPa for 30 s, and twice for 15 s, with pauses of 15 s.
+    holds_s = ((0.0, 30.0), (45.0, 60.0), (75.0, 90.0))
+    course = [
+        point
+        for begin_s, end_s in holds_s
+        for point in ((begin_s, 0.0), (begin_s + 0.2, 60.0), (end_s, 60.0), (end_s + 0.2, 0.0))
+    ]
+    bench = FaultBench(3.0, scene=pressing(12.0, 7.0, *course), settle_s=3.0)
     pressed = np.flatnonzero(_after(bench, 15.0).touched["left_forearm"])
     assert len(pressed) == 7
     bench.calibrate(3.0)
