@@ -264,8 +264,11 @@ class Rezero:
     def finish(
         self, baseline: Floats, noise: Floats, spread: Floats | None = None
     ) -> tuple[Mask, Floats]:
-        """Return the taxels bool[n] whose zero has been found now, and the new baselines [n], in
-        units.
+        """Return the taxels bool[n] whose zero has been found now, or is known better than before
+        while they are observed for longer, and the new baselines [n], in units.
+
+        Should the daemon end meanwhile, the next one judges by what it finds kept: what noise left
+        in the mean so far is less than what it left in the board's zero, one reading.
 
         Args:
             baseline: float64[n], the previous ones.
@@ -285,13 +288,16 @@ class Rezero:
         self.doubted |= found & (self._count < self._wanted)
         known = found & ~self.doubted
         # Noise that is cut off at the end of the scale gives a wrong mean.
-        ends = known & (self._n_end > SATURATED_SHARE * (self._count + self._n_far))
+        cut = self._n_end > SATURATED_SHARE * (self._count + self._n_far)
+        ends = known & cut
         # By their squares: readings of a press, before it lifted far below zero, balance in a mean.
         mean_square = np.square(units).sum(axis=0) / count
         below = ends & (mean_square > (SNAPSHOT_SIGMAS**2 + 1.0) * np.square(noise))
         self.doubted |= below
         self.cut_off |= ends & ~below
         known &= ~ends
+        late = self._sought & ~found & (self._count >= FEWEST) & ~self.unknown & ~cut
+        known |= late
         moved = self._moves(known, units, baseline, noise if spread is None else spread)
         self.moved = (self.moved & ~found) | moved
         self._wanted[moved] = np.maximum(self._wanted, self._count)[moved]
@@ -301,7 +307,8 @@ class Rezero:
         self._sought &= ~found
         self._seeks = bool(self._sought.any())
         self._found_ns[found] = self._last_ns = self._t_ns
-        return found, np.where(known & found, mean, baseline)
+        better = found | (late & ~moved)
+        return better, np.where(known & better, mean, baseline)
 
     def _moves(self, known: Mask, units: Floats, baseline: Floats, spread: Floats) -> Mask:
         """Return which of some taxels bool[n] did not rest, or higher than they do untouched.

@@ -637,19 +637,24 @@ def test_a_pad_far_below_zero_is_in_doubt_only_while_it_is(hand: Hand) -> None:
     assert hand.engine.zeros.doubts() == {}
 
 
+class Noisy(Hand):
+    """A board with one noisy pad, which is calibrated with that."""
+
+    def __init__(self) -> None:
+        #: Where its pad 7 rests.
+        self.rest = NO_LOAD - 10
+        self._noise = np.random.default_rng(3)
+        super().__init__()
+
+    def send(self, sweeps: int, **pads: int) -> None:
+        for _ in range(sweeps):
+            super().send(1, p7=int(self.rest + self._noise.integers(-9, 10)), **pads)
+
+
 def test_a_noisy_pad_may_be_touched_until_its_zero_is_known() -> None:
     """It is observed for longer than the others, which are valid by then."""
-    hand = Hand()
-    rng = np.random.default_rng(3)
-    zeros = hand.engine.zeros
-
-    def send(sweeps: int) -> None:
-        for _ in range(sweeps):
-            hand.send(1, p7=int(NO_LOAD - 10 + rng.integers(-9, 10)))
-
-    hand.engine.begin_calibration(2.0)
-    send(60)
-    hand.engine.use(hand.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    hand = Noisy()
+    zeros, send = hand.engine.zeros, hand.send
     zeros.rezero(0)
     send(40)
     assert np.flatnonzero(zeros.may_be_touched()).tolist() == [7]
@@ -658,6 +663,26 @@ def test_a_noisy_pad_may_be_touched_until_its_zero_is_known() -> None:
     assert hand.in_doubt == []
     send(80)
     assert not zeros.may_be_touched().any()
+
+
+def test_a_zero_that_is_still_sought_when_a_daemon_ends_touches_nothing_at_the_next_start() -> None:
+    """What was read of the pad until then is the best that the next one can judge it by."""
+    hand = Noisy()
+    before = hand.engine
+    before.zeros.rezero(0)
+    hand.rest -= 12
+    hand.send(40)
+    assert np.flatnonzero(before.zeros.may_be_touched()).tolist() == [7]
+    hand.engine = Engine(before.settings, before.layout, before.parts, before.calibration)
+    assert before.pipeline is not None and hand.engine.pipeline is not None
+    kept = before.pipeline.baseline
+    hand.engine.pipeline.set_zero(np.arange(len(kept), dtype=np.int32), kept)
+    hand.engine.zeros.hold([0])
+    hand.send(20)
+    hand.engine.zeros.rezero(0)
+    hand.send(120)
+    assert not hand.engine.zeros.pressed().any()
+    assert not hand.engine.zeros.at_risk(touched=True).any()
 
 
 def test_a_press_whose_last_frames_were_lost_before_another_zero_is_in_doubt(hand: Hand) -> None:
