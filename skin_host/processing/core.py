@@ -25,8 +25,9 @@ from skin_host.processing.contacts import ContactTracker, Decision
 from skin_host.processing.events import Touch
 from skin_host.processing.intake import Intake, PartSample
 from skin_host.processing.masks import Mask
-from skin_host.processing.pipeline import Pipeline, PressureFrame, unreached
+from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.pressure import PressureCurve, vertex
+from skin_host.processing.rules import Rules
 from skin_host.processing.touch import Levels
 
 if TYPE_CHECKING:
@@ -396,7 +397,7 @@ class Engine:
         if self.calibration is None or self._pipeline is None:
             return np.zeros(self.layout.n_taxels, np.bool_)
         processing = msgspec.structs.replace(self.settings.processing, touch=touch)
-        found = unreached(self.layout, processing, self.calibration)
+        found = Rules.of(self.layout, processing, self.calibration).unreached
         return found & ~self._pipeline.unreached
 
     def usable(self) -> Mask | None:

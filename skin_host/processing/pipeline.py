@@ -9,7 +9,7 @@ recognised as untouched by one comparison of bytes.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +21,18 @@ from skin_host.processing.calibration import Calibration
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.curves import (
     Curve,
-    Curves,
     Parabolas,
     Reader,
     TableCurve,
     Tables,
-    common_curve,
-    with_own,
 )
 from skin_host.processing.drift import BaselineTracker
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.own_curves import OwnCurves
 from skin_host.processing.relaxation import OWN_MEANS, make_model, parameters_of
 from skin_host.processing.relaxation import Relaxation as Model
-from skin_host.processing.touch import Levels, felt_by, levels
+from skin_host.processing.rules import Rules
+from skin_host.processing.touch import Levels
 from skin_host.processing.touch_decision import TouchDecision
 
 #: A longer step is a gap or a jump of the clock. The foam's model is advanced by it, under the
@@ -110,7 +108,7 @@ class Pipeline:
         self._layout = layout
         self.baseline = calibration.baseline.copy()
         self.relaxation_kpa = np.zeros(layout.n_taxels, np.float32)
-        self._rules = rules = _Rules.of(layout, settings, calibration)
+        self._rules = rules = Rules.of(layout, settings, calibration)
         self.enter = rules.felt.enter
         self.measurements = rules.measurements()
         self.unreached, self.flat = rules.unreached, rules.unreached & ~rules.curve.sound
@@ -135,7 +133,7 @@ class Pipeline:
         """
         self._layout = layout or self._layout
         np.copyto(self.baseline, calibration.baseline, where=zeroed)
-        self._rules = rules = _Rules.of(self._layout, settings, calibration)
+        self._rules = rules = Rules.of(self._layout, settings, calibration)
         self.enter = rules.felt.enter
         self.measurements = rules.measurements()
         self.unreached, self.flat = rules.unreached, rules.unreached & ~rules.curve.sound
@@ -235,90 +233,6 @@ class Pipeline:
         return self._parts[part_index].drift.at_limit
 
 
-class _Rules(NamedTuple):
-    """Values derived from settings and calibration, over the whole skin.
-
-    Attributes:
-        levels: what is called a touch.
-        felt: by which a press is known; the same ones if none are lower.
-    """
-
-    settings: Processing
-    usable: Mask
-    unreached: Mask
-    curve: Curve
-    curves: Curves | None
-    levels: Levels
-    felt: Levels
-
-    @classmethod
-    def of(cls, layout: Layout, settings: Processing, calibration: Calibration) -> "_Rules":
-        usable = calibration.usable & (layout.pad_kind == PadKind.PRESSURE)
-        common = common_curve(layout, settings.pressure, calibration.gain, calibration.bend)
-        curves = calibration.curves
-        curve: Curve = common
-        if curves is not None:
-            parts = [slice(part.start, part.stop) for part in layout.parts]
-            curve = with_own(common, curves, parts, ~calibration.gained)
-        above = calibration.percentile - calibration.baseline
-        spread = calibration.spread
-        if curves is not None:
-            # Some seconds at rest show less noise than a whole recording under pressure.
-            spread = np.where(curves.own, np.fmax(spread, curves.noise_units), spread)
-        known = np.isfinite(above) & np.isfinite(spread)
-        above, spread = np.where(known, above, 0.0), np.where(known, spread, 0.0)
-        found = felt = levels(above, spread, settings.touch)
-        finest = felt_by(settings.touch)
-        if finest != settings.touch:
-            felt = levels(above, spread, finest)
-        # A reading ends at 0: a larger threshold would leave a pressed taxel untouched. So would a
-        # curve that does not rise, and a noise that is no number.
-        reached = found.decides <= layout.no_load - calibration.baseline
-        reached &= known & curve.sound
-        unreached = usable & ~reached
-        return cls(settings, usable & ~unreached, unreached, curve, curves, found, felt)
-
-    def measurements(self) -> NDArray[np.int64]:
-        """Return in how many measurements both are decided [n]."""
-        votes = self.settings.touch.votes_of_3
-        found = self.levels.measurements(votes)
-        return (
-            found if self.felt is self.levels else np.maximum(found, self.felt.measurements(votes))
-        )
-
-    def part(self, mine: slice) -> "_Rules":
-        """Return those of some of the taxels; unusable taxels are never touched."""
-        usable = self.usable[mine]
-
-        def of(found: Levels) -> Levels:
-            return Levels(
-                np.where(usable, found.enter[mine], np.inf),
-                np.where(usable, found.leave[mine], np.inf),
-                np.where(usable, found.whole[mine], np.inf),
-                found.span[mine],
-                found.hold[mine],
-                found.fall[mine],
-                found.votes[mine],
-                found.spread[mine],
-            )
-
-        called = of(self.levels)
-        return _Rules(
-            self.settings,
-            usable,
-            self.unreached[mine],
-            self.curve.part(mine),
-            self.curves,
-            called,
-            called if self.felt is self.levels else of(self.felt),
-        )
-
-
-def unreached(layout: Layout, settings: Processing, calibration: Calibration) -> Mask:
-    """Return taxels bool[n] of which no reading would be a touch, see `Pipeline.unreached`."""
-    return _Rules.of(layout, settings, calibration).unreached
-
-
 class _Window:
     """Sums over the samples of a time, of m taxels.
 
@@ -355,7 +269,7 @@ class _Window:
 class _PartPipeline:
     """One part's share of the flat arrays, and work arrays that are reused."""
 
-    def __init__(self, skin: Pipeline, layout: Layout, part: PartLayout, rules: _Rules) -> None:
+    def __init__(self, skin: Pipeline, layout: Layout, part: PartLayout, rules: Rules) -> None:
         self._mine = mine = slice(part.start, part.stop)
         m = part.n_taxels
         self._name = part.name
@@ -412,7 +326,7 @@ class _PartPipeline:
         self._lacking = np.zeros(m, np.int32)
         self._since_glance_s = 0.0
 
-    def renew(self, rules: _Rules, zeroed: Mask) -> None:
+    def renew(self, rules: Rules, zeroed: Mask) -> None:
         before = self._rules
         rules = rules.part(self._mine)
         zeroed = zeroed[self._mine]
@@ -435,7 +349,7 @@ class _PartPipeline:
         self._adopt(rules)
         self._begin_anew(zeroed)
 
-    def _decide_by(self, rules: _Rules) -> None:
+    def _decide_by(self, rules: Rules) -> None:
         """Use the levels of these rules from now on."""
         votes = rules.settings.touch.votes_of_3
         if rules.felt is rules.levels:
@@ -448,7 +362,7 @@ class _PartPipeline:
             decision.use(found, votes)
         self._nothing = [self._nowhere] * len(self._decisions)
 
-    def _adopt(self, rules: _Rules) -> None:
+    def _adopt(self, rules: Rules) -> None:
         """Compute what each sweep needs from the rules."""
         self._rules = rules
         self._curve = curve = rules.curve
@@ -474,7 +388,7 @@ class _PartPipeline:
         self._far_taxels: tuple[bytes, NDArray[np.intp], Curve] | None = None
         self._renew_limits()
 
-    def _set_model(self, rules: _Rules) -> None:
+    def _set_model(self, rules: Rules) -> None:
         """Start a new relaxation model; a foam model that was fitted with curves replaces the
         configured one.
         """
