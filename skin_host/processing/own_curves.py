@@ -29,7 +29,7 @@ class OwnCurves:
     """Extra state of taxels with own curves: smoothing, memory, and detection of jumps.
 
     Cost follows touch: touched taxels, or all where more than a quarter is touched, are smoothed
-    and remembered in each sweep, the others from the means of `pipeline.ROWS` sweeps: their
+    and remembered in each sweep, the others from the means of `windows.ROWS` sweeps: their
     reported pressures change as seldom.
 
     Args:

@@ -34,20 +34,17 @@ from skin_host.processing.relaxation import Relaxation as Model
 from skin_host.processing.rules import Rules
 from skin_host.processing.touch import Levels
 from skin_host.processing.touch_decision import TouchDecision
+from skin_host.processing.windows import Window, Windows
 
 #: A longer step is a gap or a jump of the clock. The foam's model is advanced by it, under the
 #: readings after it; nothing else depends on its length.
 LONGEST_STEP_S = 1.0
 #: Baselines move this often.
 WINDOW_S = 1.0
-#: If the pressures of an untouched part are not subscribed, they are computed once in this time.
-IDLE_UPDATE_S = 0.2
 #: The curve of a taxel hardly bends below this.
 STRAIGHT_UNITS = 2.0
 #: Smaller relaxation does not affect the touch decision.
 RELAXED_KPA = 0.01
-#: Samples are stored and summed this many at a time, for fewer passes over the taxels.
-ROWS = 8
 
 Floats = NDArray[np.float32]
 _T = TypeVar("_T", bound=np.generic)
@@ -233,39 +230,6 @@ class Pipeline:
         return self._parts[part_index].drift.at_limit
 
 
-class _Window:
-    """Sums over the samples of a time, of m taxels.
-
-    Attributes:
-        sum_kpa: float32[m], of the pressures without the relaxation.
-        lowest_kpa: float32[m], lowest mean of `ROWS` samples, infinite if there are not so many.
-        samples: how many they are.
-        skipped: sweeps that no sample stands for.
-        elapsed_s: how long they all took.
-    """
-
-    def __init__(self, m: int) -> None:
-        self.sum_kpa = np.zeros(m, np.float32)
-        self.lowest_kpa = np.empty(m, np.float32)
-        self.clear()
-
-    def clear(self) -> None:
-        """Begin the next."""
-        self.sum_kpa.fill(0.0)
-        self.lowest_kpa.fill(np.inf)
-        self.samples = 0
-        self.skipped = 0
-        self.elapsed_s = 0.0
-
-    def add(self, piece: "_Window") -> None:
-        """Add what followed."""
-        np.add(self.sum_kpa, piece.sum_kpa, out=self.sum_kpa)
-        np.fmin(self.lowest_kpa, piece.lowest_kpa, out=self.lowest_kpa)
-        self.samples += piece.samples
-        self.skipped += piece.skipped
-        self.elapsed_s += piece.elapsed_s
-
-
 class _PartPipeline:
     """One part's share of the flat arrays, and work arrays that are reused."""
 
@@ -295,6 +259,9 @@ class _PartPipeline:
         periods_ms = [layout.boards[board].settings.period_ms for board in part.boards]
         self._interval_s = max(max(periods_ms) * 1e-3, CONVERSION_S)
         self._triangle_of = layout.triangle_of[mine]
+        self._windows = Windows(m, WINDOW_S, self._fold)
+        #: For passing use.
+        self._scratch_kpa = np.empty(m, np.float32)
         rules = rules.part(mine)
         self._set_model(rules)
         self.drift = BaselineTracker(
@@ -310,21 +277,9 @@ class _PartPipeline:
         self._adopt(rules)
         self._last_raw = self._untouched_raw()
 
-        self._rows = np.zeros((ROWS, m), np.float32)
-        self._row = list(self._rows)
-        self._laid = 0
-        self._part_kpa = np.empty(m, np.float32)
-        #: The windows of the baselines and of the relaxation, and what is in neither yet: it ends
-        #: with the one that ends first.
-        self._drifting, self._relaxing, self._piece = (_Window(m) for _ in range(3))
-        #: Skipped sweeps since the last sample, how long they took, and the sums of their bytes.
-        self._unseen = 0
-        self._unseen_s = 0.0
-        self._unseen_raw = np.zeros(m, np.int32)
         self._noted = self._nowhere
         #: How many sweeps of the window lacked each taxel.
         self._lacking = np.zeros(m, np.int32)
-        self._since_glance_s = 0.0
 
     def renew(self, rules: Rules, zeroed: Mask) -> None:
         before = self._rules
@@ -336,7 +291,7 @@ class _PartPipeline:
         else:
             other_foam = not rules.curves.is_same(before.curves)
         if other_foam or (other_model and rules.curves is None):
-            self._fold()
+            self._windows.fold()
             self._set_model(rules)
         elif self._own is not None:
             self._own.use(rules.settings.pressure.smoothing_s)
@@ -396,9 +351,7 @@ class _PartPipeline:
         self._relaxation: Model | None = None
         self._own: OwnCurves | None = None
         self._every_sample = False
-        self._update_s = WINDOW_S
-        #: How long the present piece of a window is at least.
-        self._piece_s = WINDOW_S
+        self._windows.relax_in(WINDOW_S)
         if rules.curves is not None:
             smoothing_s = rules.settings.pressure.smoothing_s
             self._own = OwnCurves(
@@ -419,8 +372,7 @@ class _PartPipeline:
             dtype=np.float32 if windowed else np.float64,
         )
         if windowed:
-            self._update_s = chosen.update_s
-            self._piece_s = min(WINDOW_S, self._update_s)
+            self._windows.relax_in(chosen.update_s)
 
     def step(
         self, raw: NDArray[np.uint8], present: Mask, t_ns: int, pressures: bool
@@ -446,17 +398,19 @@ class _PartPipeline:
         pressed, touched = decided[0], decided[-1]
         quiet = pressed is touched is self._nowhere and not self._every_sample
         quiet = quiet and not (self._felt.residuals.any or self._called.residuals.any)
-        if quiet and not pressures and not self._due(dt_s):
-            self._piece.elapsed_s += dt_s
-            self._unseen_s += dt_s
-            self._unseen += 1
-            np.add(self._unseen_raw, self._last_raw, out=self._unseen_raw)
+        windows = self._windows
+        if quiet and not pressures and not windows.due(dt_s):
+            windows.skip(self._last_raw, dt_s)
             return self._frame(t_ns, raw, valid, self._zeros, self._nowhere, self._nowhere, False)
-        self._since_glance_s = 0.0
         cut_off = 255 in self._last_raw.tobytes()
         beyond = self._beyond(cut_off) if cut_off or not (idle and quiet) else self._nowhere
-        corrected, pressure = self._pressures(beyond, pressed, self._unseen_s + dt_s)
-        self._gather(corrected, pressed, dt_s, quiet)
+        corrected, pressure = self._pressures(beyond, pressed, windows.unseen_s + dt_s)
+        over = windows.add(self._last_raw, dt_s, self._kpa_per_unit if quiet else None)
+        if pressed is not self._noted:
+            np.logical_or(self._was_touched, pressed, out=self._was_touched)
+            self._noted = pressed
+        if over:
+            self._end_piece()
         if not quiet:
             relaxation_kpa = self._relaxation_kpa
             found = []
@@ -498,17 +452,13 @@ class _PartPipeline:
         self._relaxation_kpa[taxels] = 0.0
         for decision in self._decisions:
             decision.residuals.reset(taxels)
-        self._rows[:, taxels] = 0.0
-        for window in (self._piece, self._drifting, self._relaxing):
-            window.sum_kpa[taxels] = 0.0
-            window.lowest_kpa[taxels] = np.inf
+        self._windows.forget(taxels)
         self._was_touched[taxels] = False
         self._noted = self._nowhere
 
     def _begin_anew(self, taxels: Mask) -> None:
         self._last_raw = np.where(taxels, self._untouched_raw(), self._last_raw)
-        unseen_raw = np.multiply(self._last_raw, self._unseen, dtype=np.int32)
-        np.copyto(self._unseen_raw, unseen_raw, where=taxels)
+        self._windows.begin_anew(taxels, self._last_raw)
         for decision in self._decisions:
             decision.detector.reset(taxels)
 
@@ -559,7 +509,7 @@ class _PartPipeline:
         if self._relaxation is None:
             return
         self._end_piece(early=True)
-        momentary = self._part_kpa
+        momentary = self._scratch_kpa
         self._reader.kpa(self._last_raw, momentary)
         beyond = self._beyond(cut_off=True)
         if beyond is not self._nowhere:
@@ -570,13 +520,6 @@ class _PartPipeline:
         np.fmax(momentary, self._zeros, out=momentary)
         self._relaxation.step(momentary, gap_s, self._relaxation_kpa)
         self._renew_limits()
-
-    def _due(self, dt_s: float) -> bool:
-        """Whether a quiet sweep is computed anyway: for the means, and at their end."""
-        self._since_glance_s += dt_s
-        return (
-            self._since_glance_s >= IDLE_UPDATE_S or self._piece.elapsed_s + dt_s >= self._piece_s
-        )
 
     def _receive(self, raw: NDArray[np.uint8], present: Mask) -> Mask:
         """Take in the bytes; return which are valid."""
@@ -630,7 +573,7 @@ class _PartPipeline:
 
         The first is stored for the means.
         """
-        row = self._row[self._laid]
+        row = self._windows.row
         self._reader.kpa(self._last_raw, row)
         if self._own is not None:
             if beyond is not self._nowhere and not isinstance(self._curve, TableCurve):
@@ -644,7 +587,7 @@ class _PartPipeline:
             row[taxels] = self._beyond_kpa(taxels, curve)
         if self._every_sample and self._relaxation is not None:
             # Foam is not pulled: a taxel with too low a reading has nothing to relax from.
-            pressed = np.fmax(row, self._zeros, out=self._part_kpa)
+            pressed = np.fmax(row, self._zeros, out=self._scratch_kpa)
             self._relaxation.step(pressed, dt_s, self._relaxation_kpa)
             np.subtract(row, self._relaxation_kpa, out=row)
         return row, np.fmax(row, self._zeros)
@@ -668,55 +611,18 @@ class _PartPipeline:
         activations: Floats = self._offset[taxels] - self._last_raw[taxels]
         return activations
 
-    def _gather(self, corrected: Floats, touched: Mask, dt_s: float, quiet: bool) -> None:
-        """Add the sample to the window's means; at its end update the slow state.
-
-        With a quiet sample the sweeps that were skipped before it are added: from it they differ by
-        bytes near zero, where the curve is straight. What was skipped before a touch was none, and
-        counts as relaxed.
-        """
-        piece = self._piece
-        if self._unseen:
-            if quiet:
-                beyond_units = np.multiply(self._last_raw, self._unseen, dtype=np.int32)
-                beyond_units -= self._unseen_raw
-                piece.sum_kpa += corrected * np.float32(self._unseen)
-                piece.sum_kpa += beyond_units * self._kpa_per_unit
-                piece.samples += self._unseen
-            else:
-                piece.skipped += self._unseen
-            self._forget_unseen()
-        self._laid += 1
-        if self._laid == ROWS:
-            self._fold()
-        piece.samples += 1
-        piece.elapsed_s += dt_s
-        if touched is not self._noted:
-            np.logical_or(self._was_touched, touched, out=self._was_touched)
-            self._noted = touched
-        if piece.elapsed_s >= self._piece_s:
-            self._end_piece()
-
-    def _forget_unseen(self) -> None:
-        self._unseen, self._unseen_s = 0, 0.0
-        self._unseen_raw.fill(0)
-
     def _end_piece(self, early: bool = False) -> None:
         """Update the slow state from the means of the windows that have ended, or end `early`."""
-        self._fold()
-        piece, drifting, relaxing = self._piece, self._drifting, self._relaxing
-        piece.skipped += self._unseen
-        self._forget_unseen()
-        drifting.add(piece)
-        relaxing.add(piece)
-        piece.clear()
-        if drifting.samples and (early or drifting.elapsed_s >= WINDOW_S):
-            self._follow_drift(drifting)
-            drifting.clear()
-        if relaxing.samples and (early or relaxing.elapsed_s >= self._update_s):
+        windows = self._windows
+        drifted, relaxed = windows.end_piece(early)
+        if drifted:
+            self._follow_drift(windows.drifting)
+            windows.drifting.clear()
+        if relaxed:
+            relaxing = windows.relaxing
             if self._relaxation is not None and not self._every_sample:
                 # Within the window it was constant, and skipped sweeps were relaxed.
-                momentary = self._part_kpa
+                momentary = self._scratch_kpa
                 scale = 1.0 / (relaxing.samples + relaxing.skipped)
                 np.multiply(relaxing.sum_kpa, scale, out=momentary)
                 np.add(momentary, self._relaxation_kpa, out=momentary)
@@ -724,12 +630,12 @@ class _PartPipeline:
                 self._relaxation.step(momentary, relaxing.elapsed_s, self._relaxation_kpa)
             relaxing.clear()
         self._renew_limits()
-        if not drifting.samples:
+        if not windows.drifting.samples:
             self._was_touched.fill(False)
             self._noted = self._nowhere
-        self._piece_s = min(WINDOW_S - drifting.elapsed_s, self._update_s - relaxing.elapsed_s)
+        windows.begin_piece()
 
-    def _follow_drift(self, window: _Window) -> None:
+    def _follow_drift(self, window: Window) -> None:
         """Move the baselines by the means of a window."""
         elapsed_s = window.elapsed_s
         mean_kpa = np.divide(window.sum_kpa, window.samples, dtype=np.float64)
@@ -763,7 +669,7 @@ class _PartPipeline:
             decision.residuals.fade(elapsed_s)
         self._lacking.fill(0)
 
-    def _conversions(self, window: _Window) -> NDArray[np.float64]:
+    def _conversions(self, window: Window) -> NDArray[np.float64]:
         """Return how many independent measurements are in the mean of each taxel [m].
 
         A reading that was not received is the last one again. Where the share p is lost by chance,
@@ -795,16 +701,9 @@ class _PartPipeline:
             units[far] = np.where(c < 0.0, 2.0 * below / (curve.linear + root), curve.units(c))
         return units
 
-    def _fold(self) -> None:
-        np.add.reduce(self._rows[: self._laid], axis=0, out=self._part_kpa)
-        if self._own is not None and self._laid:
-            self._own.fold(self._rows[: self._laid], self._part_kpa, self._relaxation_kpa)
-        piece = self._piece
-        np.add(piece.sum_kpa, self._part_kpa, out=piece.sum_kpa)
-        if self._laid == ROWS:
-            np.multiply(self._part_kpa, np.float32(1.0 / ROWS), out=self._part_kpa)
-            np.fmin(piece.lowest_kpa, self._part_kpa, out=piece.lowest_kpa)
-        self._laid = 0
+    def _fold(self, rows: Floats, sums_kpa: Floats) -> None:
+        if self._own is not None:
+            self._own.fold(rows, sums_kpa, self._relaxation_kpa)
 
     def _renew_limits(self) -> None:
         """Compute the curve at each byte, and the bytes from which on it may be touched or beyond

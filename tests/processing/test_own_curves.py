@@ -12,9 +12,10 @@ from skin_host.processing.curves import Curves, CurveVerdict, Memory
 from skin_host.processing.drift import BaselineTracker
 from skin_host.processing.fitting.course import limit_kpa, make_memory
 from skin_host.processing.own_curves import RISE_UNITS_PER_S, OwnCurves
-from skin_host.processing.pipeline import ROWS, PressureFrame
+from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.smoothing import StepFilter
+from skin_host.processing.windows import ROWS
 from tests.processing.fitting.test_course import use_own_curves
 
 PRESSED = np.arange(192) < 12
