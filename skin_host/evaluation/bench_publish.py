@@ -29,7 +29,7 @@ from skin_host.mqtt.frames import encode_frame
 from skin_host.mqtt.packets import publish_head, publish_packet
 from skin_host.mqtt.payload import JSON_TYPE
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 
 TAXELS = (192, 816, 2000)
 RATE_HZ = 50.0

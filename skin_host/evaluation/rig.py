@@ -15,7 +15,8 @@ from emulator.chips.noise import SampledNoise
 from skin_host.config.settings import Settings
 from skin_host.layout import Layout, build_layout
 from skin_host.processing.calibration.calibrator import KNOWN_SAMPLES, Calibrator
-from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.processing.frame import PressureFrame
+from skin_host.processing.pipeline import Pipeline
 
 BOARDS_PER_BUS = 14
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from skin_host.layout import TAXELS_PER_TRIANGLE
 from skin_host.processing.core import Engine, Output, Step
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.masks import Mask, any_of, count_of
-from skin_host.processing.pipeline import PressureFrame
 
 if TYPE_CHECKING:
     from skin_host.bus.boards import Boards

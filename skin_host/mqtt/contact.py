@@ -12,8 +12,8 @@ from skin_host.mqtt.messages import ContactState
 from skin_host.processing.contacts import LOST_NS
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.events import Touch
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.masks import all_of, any_of
-from skin_host.processing.pipeline import PressureFrame
 
 if TYPE_CHECKING:
     from skin_host.processing.core import Engine

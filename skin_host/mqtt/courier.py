@@ -33,7 +33,7 @@ from skin_host.mqtt.outbox import Outbox
 from skin_host.mqtt.packets import publish_head, publish_packet
 from skin_host.mqtt.topics import Topics
 from skin_host.mqtt.trials import REJECTIONS
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 
 #: Limit of unacknowledged messages. Together less than the 20 that mosquitto and paho allow, so
 #: that touches never wait behind health.

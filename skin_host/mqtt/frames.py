@@ -89,7 +89,7 @@ def _head(payload: bytes, at: int, what: str) -> tuple[int, int, int]:
 
 
 if TYPE_CHECKING:
-    from skin_host.processing.pipeline import PressureFrame
+    from skin_host.processing.frame import PressureFrame
 
 
 HexMask = Annotated[str, Meta(max_length=MAX_TAXELS // 4)]

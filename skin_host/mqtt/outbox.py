@@ -18,7 +18,7 @@ from skin_host.fingertip.events import FingertipEvent
 from skin_host.mqtt.connection import MessageProperties
 from skin_host.mqtt.messages import encode_event
 from skin_host.mqtt.trials import Trials
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 
 #: Events that are sent again to another broker: acknowledged within this time, and at most this
 #: many. A frozen broker is noticed after 3 s.

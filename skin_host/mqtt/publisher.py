@@ -62,7 +62,7 @@ from skin_host.mqtt.payload import CBOR_TYPE, JSON_TYPE
 from skin_host.mqtt.topics import OFFLINE, ONLINE, PartTopic, Topics
 from skin_host.mqtt.trials import TRIES, Trials
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.tasks import cancel, leave_if_cancelled
 
 FRAME_EXPIRY_S = 1

@@ -18,10 +18,11 @@ from skin_host.bus.wire import TRIANGLES, StatusError
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.drift import SETTLE_S
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.intake import Intake, below_zero, lifted
 from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask, any_of
-from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.processing.pipeline import Pipeline
 from skin_host.processing.pressed_zero import PressedZero
 from skin_host.processing.rezero import (
     BELOW_SWEEPS,

@@ -23,9 +23,10 @@ from skin_host.processing.calibration.calibrator import KNOWN_SAMPLES, Calibrato
 from skin_host.processing.calibration.run import CalibrationRun
 from skin_host.processing.contacts import ContactTracker, Decision
 from skin_host.processing.events import Touch
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.intake import Intake, PartSample
 from skin_host.processing.masks import Mask
-from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.processing.pipeline import Pipeline
 from skin_host.processing.pressure import PressureCurve, vertex
 from skin_host.processing.rules import Rules
 from skin_host.processing.touch import Levels

@@ -1,7 +1,7 @@
 """Sums of the pressures of a part over the windows in which its slow state moves.
 
-Samples are stored, and summed some at a time, for fewer passes over the taxels. Nobody wants most
-sweeps of an untouched part: they are skipped, and the next sample stands for them.
+Samples are stored, and summed some at a time, for fewer passes over the taxels. Most sweeps of an
+untouched part whose pressures are not subscribed are skipped: the next sample stands for them.
 """
 
 from collections.abc import Callable
@@ -100,8 +100,8 @@ class Windows:
         return self._row[self._laid]
 
     def due(self, dt_s: float) -> bool:
-        """Return whether a sweep that nobody wants is sampled anyway, for the sums, and at the end
-        of a piece.
+        """Return whether a sweep that could be skipped is sampled anyway, for the sums, and at the
+        end of a piece.
         """
         self._since_sample_s += dt_s
         sampled = self._since_sample_s >= IDLE_UPDATE_S

@@ -17,8 +17,8 @@ from skin_host.fingertip.events import FingertipEvent
 from skin_host.mqtt.messages import encode_event, health_keys
 from skin_host.processing.core import Output
 from skin_host.processing.events import KPA_DECIMALS
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.masks import any_of
-from skin_host.processing.pipeline import PressureFrame
 
 #: So many frames are written at once. Of more, the work arrays would leave the processor's cache.
 BLOCK_FRAMES = 32

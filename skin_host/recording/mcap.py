@@ -27,7 +27,7 @@ from skin_host.mqtt.info import INFO_SCHEMA, NodeInfo
 from skin_host.mqtt.messages import EVENT_DECODERS, HEALTH_SCHEMA, Frame, decode_contact
 from skin_host.mqtt.topics import PartTopic, Topics, wrong_topic
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.untrusted import from_json
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.support.broker import Mosquitto, free_port
 from tests.support.said import touch_event
 from tests.support.waiting import PATIENCE_S, until

@@ -23,7 +23,7 @@ from emulator import faults
 from skin_host.cli import build_parser
 from skin_host.cli.common import run
 from skin_host.mqtt.frames import encode_frame
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.support import programs
 from tests.support.broker import Mosquitto, free_port
 from tests.support.pages import PAGES, ROOT, Block, Command, blocks, commands

@@ -28,7 +28,7 @@ from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import Load
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.tasks import cancel
 from tests.support import ros
 from tests.support.broker import Mosquitto

@@ -11,7 +11,7 @@ from skin_host.health.diagnosis import COMMON_UNITS
 from skin_host.health.watch import FOAM_NS, PartWatch
 from skin_host.processing.calibration import Verdict
 from skin_host.processing.core import Step
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.support.fault_bench import CONFIG, FaultBench
 
 TRIANGLES = np.repeat(np.arange(3), 10)

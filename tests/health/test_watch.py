@@ -12,7 +12,7 @@ from skin_host.config.settings import load
 from skin_host.health.watch import BoardWatch, BusWatch, PartWatch, Watch, Window
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine, Step
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.support.fault_bench import CONFIG
 
 MS = 1_000_000

@@ -15,7 +15,7 @@ from skin_host.processing.contacts import LOST_NS
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.core import Output
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.support.branch import branch
 from tests.support.fault_bench import CONFIG, FaultBench
 from tests.support.said import touch_event

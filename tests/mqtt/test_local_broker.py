@@ -15,7 +15,7 @@ from skin_host.config.settings import Mqtt
 from skin_host.errors import BrokerError
 from skin_host.mqtt import broker as local
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.support.said import touch_event
 from tests.support.waiting import until
 

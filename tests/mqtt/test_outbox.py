@@ -13,7 +13,7 @@ from skin_host.clock import SteppedClock
 from skin_host.mqtt.outbox import BACKLOG, REPEAT_S, REPEATED, Event, Outbox, State
 from skin_host.mqtt.trials import HOLD_S
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.support.said import touch_event
 
 

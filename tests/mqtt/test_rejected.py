@@ -13,7 +13,7 @@ from msgspec import json
 from skin_host.mqtt import trials
 from skin_host.mqtt.publisher import Publisher
 from skin_host.mqtt.trials import HOLD_S, LONGEST_HOLD_S, TRIES, Trials
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.mqtt.test_publisher import frame, listening, settings, touch
 from tests.support.broker import Mosquitto
 from tests.support.waiting import until

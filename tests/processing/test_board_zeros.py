@@ -14,7 +14,7 @@ from skin_host.health import HealthWatch
 from skin_host.layout import build_layout
 from skin_host.processing.calibration import Verdict
 from skin_host.processing.core import Engine, Output, Step
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.silent_zero import SWEEPS
 from tests.support.stack import ROOT
 

@@ -13,8 +13,8 @@ from skin_host.evaluation.rig import Rig, flat_skin
 from skin_host.layout import PadKind, build_layout
 from skin_host.processing.contacts import ALIVE_NS, LOST_NS, ContactTracker
 from skin_host.processing.contacts.tracker import MERGED_NS, PARTED_NS
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.localization_centroid import GEOMETRY_PITCHES, nearest_distance
-from skin_host.processing.pipeline import PressureFrame
 
 SETTINGS, LAYOUT = flat_skin(1)
 N = LAYOUT.n_taxels

@@ -15,8 +15,8 @@ from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout, build_layout
 from skin_host.processing.contacts import ContactTracker
 from skin_host.processing.events import Touch
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.localization import Method
-from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.pressure import PressureCurve
 
 UNITS = 57.0

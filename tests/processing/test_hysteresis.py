@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skin_host.evaluation.rig import Rig
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 
 
 def press(rig: Rig, units: float, seconds: float) -> list[PressureFrame]:

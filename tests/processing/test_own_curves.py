@@ -11,8 +11,8 @@ from skin_host.evaluation.rig import Rig
 from skin_host.processing.curves import Curves, CurveVerdict, Memory
 from skin_host.processing.drift import BaselineTracker
 from skin_host.processing.fitting.course import limit_kpa, make_memory
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.own_curves import RISE_UNITS_PER_S, OwnCurves
-from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.smoothing import StepFilter
 from skin_host.processing.windows import ROWS

@@ -1,4 +1,4 @@
-"""Sums over the samples of a part, also those of sweeps that nobody wanted."""
+"""Sums over the samples of a part, also for sweeps that were skipped."""
 
 import numpy as np
 

@@ -13,7 +13,7 @@ from skin_host.layout import build_layout
 from skin_host.mqtt.frames import encode_frame
 from skin_host.processing.calibration import with_curves
 from skin_host.processing.curves import KNOTS_UNITS, Curves, Memory, rising
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.recording import plots
 from skin_host.recording.export import Series, export, read_frames, read_messages
 from skin_host.recording.mcap import Recorder

@@ -11,7 +11,7 @@ from msgspec import json
 
 from skin_host.mqtt.messages import encode_event
 from skin_host.processing.core import Output, Step
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.recording.lines import BLOCK_FRAMES, EventLines, LineWriter, frame_lines
 from tests.support.said import make_event, make_frame
 

@@ -22,7 +22,7 @@ from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import PartInfo, node_info
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.recording.export import live
 from skin_host.recording.export.scene import Arrows, EventLine, Points
 from tests.support.broker import Mosquitto, free_port

@@ -17,7 +17,7 @@ from skin_host.layout import build_layout
 from skin_host.mqtt.frames import encode_frame
 from skin_host.mqtt.info import encode_info, node_info
 from skin_host.mqtt.messages import encode_event, encode_health
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.recording.export import read_messages
 from skin_host.recording.export.columns import TABLES
 from skin_host.recording.mcap import Recorder

@@ -14,7 +14,7 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError
 from skin_host.mqtt.frames import encode_frame
 from skin_host.mqtt.messages import encode_event
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.recording.mcap import Recorder, read_can, read_messages_of
 from tests.support.said import touch_event
 

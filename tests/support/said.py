@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 
 #: In this order a test may give what it is about.
 _KEYS = (

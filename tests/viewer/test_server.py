@@ -26,7 +26,7 @@ from skin_host.mqtt.commands import Handler
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.recording import capture
 from skin_host.recording.mcap import read_messages_of
 from skin_host.viewer import server

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.masks import Mask, any_of
-from skin_host.processing.pipeline import PressureFrame
 
 Floats = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.masks import Mask, any_of
-from skin_host.processing.pipeline import PressureFrame
 
 #: A taxel that is not received for less than this time counts as it was last received.
 LOST_NS = 500_000_000

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from skin_host.config.settings import Settings
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.events import Vector
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.localization import Localizer, make_localizer, separate
 from skin_host.processing.masks import Mask
-from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.pressure import PressureCurve
 
 Floats = NDArray[np.float64]

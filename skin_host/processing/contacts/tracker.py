@@ -13,9 +13,9 @@ from skin_host.processing.contacts.held import Held
 from skin_host.processing.contacts.neighbours import Near, Unfelt
 from skin_host.processing.contacts.places import Places
 from skin_host.processing.events import Reason, Touch, Vector
+from skin_host.processing.frame import PressureFrame
 from skin_host.processing.localization_centroid import GEOMETRY_PITCHES
 from skin_host.processing.masks import Mask, all_of, any_of
-from skin_host.processing.pipeline import PressureFrame
 
 Floats = NDArray[np.float64]
 

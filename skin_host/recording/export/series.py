@@ -31,7 +31,7 @@ from skin_host.mqtt.payload import MessageError
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from skin_host.recording.export.columns import TABLES
 from skin_host.recording.export.known import CONTACT_STALE_S, ContactLine, Gone, Known
 from skin_host.recording.mcap import read_messages_of, robot_at

@@ -23,7 +23,8 @@ from skin_host.fingertip.tip import Tip
 from skin_host.processing import pipeline, touch
 from skin_host.processing.contacts import ContactTracker
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.processing.frame import PressureFrame
+from skin_host.processing.pipeline import Pipeline
 from skin_host.processing.touch import Floats, Levels, levels
 
 DEMO = configuration("demo.toml")

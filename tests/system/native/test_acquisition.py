@@ -18,7 +18,7 @@ import pytest
 
 from emulator.probes.scene import Scene
 from skin_host.health import Record
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.support.broker import Mosquitto, break_at_random
 from tests.support.programs import require
 from tests.support.scheduled_bus import ScheduledBus

@@ -10,7 +10,7 @@ import pytest
 from skin_host.client import SkinClient, Stream, Touch
 from skin_host.config.settings import Mqtt
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.support.broker import Mosquitto, break_at_random
 from tests.support.said import touch_event
 

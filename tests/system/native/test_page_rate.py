@@ -19,7 +19,7 @@ from skin_host.layout import Layout, build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 from tests.support.broker import Mosquitto
 from tests.support.devtools import Page
 from tests.support.said import touch_event

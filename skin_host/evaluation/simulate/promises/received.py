@@ -18,7 +18,7 @@ from skin_host.evaluation.simulate.promises.limits import (
 )
 from skin_host.evaluation.simulate.world import World
 from skin_host.layout import Layout
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 
 
 @dataclass(frozen=True, slots=True)

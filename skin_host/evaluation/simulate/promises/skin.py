@@ -27,7 +27,7 @@ from skin_host.evaluation.simulate.promises.truth import Floats, Truth
 from skin_host.evaluation.simulate.world import World
 from skin_host.layout import PadKind
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 
 
 @dataclass(slots=True)
