@@ -161,6 +161,7 @@ class AdapterPort(Port):
         super().__init__(name, settings, bus, clock)
         self._worker = worker
         self._opening = opening
+        self._opening_since_s = self._clock.monotonic_s()
         self._unreadable = 0
         self._stamps = Stamps()
         self._id = np.zeros(CAPACITY, np.uint32)
@@ -218,6 +219,11 @@ class AdapterPort(Port):
         try:
             async with self._clock.timeout(SEND_DEADLINE_S):
                 await asyncio.wrap_future(sending)
+        except ConnectionError as error:
+            # A library may read the end of a connection as no frame: only sending shows it.
+            if self._bus is bus:
+                self._note_failure(error)
+            raise
         except TimeoutError:
             if sending.done() and not sending.cancelled():
                 raise  # the library's own
@@ -316,6 +322,7 @@ class AdapterPort(Port):
         if self._opening is None:
             if self._time_to_check():
                 self._opening = self._in_order().submit(open_bus, self.name, self._settings)
+                self._opening_since_s = self._clock.monotonic_s()
         elif self._opening.done():
             opening, self._opening = self._opening, None
             error = opening.exception()
@@ -325,6 +332,14 @@ class AdapterPort(Port):
             self._bus = opening.result()
             self.counters.reopened += 1
             self._enter(LinkState.UP)
+        elif not self.unopened and self._clock.monotonic_s() - self._opening_since_s >= OPEN_S:
+            self.note_unopened(no_answer(self.name, self._settings))
+
+
+def no_answer(name: str, settings: Bus) -> BusError:
+    """Return the error of an interface whose library has been opening it for too long."""
+    where = f'bus "{name}": {settings.interface} {settings.channel}'
+    return BusError(f"{where}: has not answered for {OPEN_S:g} s: check its plug and power")
 
 
 def open_bus(name: str, settings: Bus) -> can.BusABC:

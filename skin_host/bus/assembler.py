@@ -1,10 +1,10 @@
 """Assembles frames into sweeps: one assembler per bus.
 
 A sweep is one board's values of one period. The frames have no sequence number and no guaranteed
-order, so the end of a sweep is inferred: a slot (triangle and half) that comes twice, a pause, or
-the age of the sweep's first frame starts a new one. A sweep is returned as soon as every awaited
-triangle is complete. A triangle that has been missing for a while is no longer awaited, so that it
-causes no delay, until it sends again.
+order, so the end of a sweep is inferred: a slot (triangle and half) that comes twice, a pause, the
+age of the sweep's first frame, or the usual first frame after late ones of the sweep before starts
+a new one. A sweep is returned as soon as every awaited triangle is complete. A triangle that has
+been missing for a while is no longer awaited, so that it causes no delay, until it sends again.
 
 A board usually sends its frames in the same order. Once that order is known, a sweep or a run of
 frames in it is recognised by one comparison of bytes and copied as a whole; all other frames are
@@ -63,20 +63,25 @@ _SHORTEST_RUN = 5
 _SET_BACK_NS = 100_000_000
 #: Where a frame's head has its length.
 _DLC_AT = 4
-#: Up to here heads identify a frame; then follows what nobody reads, and the header.
+#: Up to here heads identify a frame; then follows what is not read, and the header.
 _PAD_AT = 5
 #: After so many sweeps in another order than the known one, which lost frames cause too, the order
 #: is learnt again, after a pause of so many sweeps.
 _MOST_STRAY_SWEEPS = 4
 _LEARN_AFTER_SWEEPS = 64
-#: Classes of A and of B frames: the stream, the legacy stream, and the class in which a special
-#: firmware sends B frames.
-_CLASSES = {
-    HEADER_A: (MessageClass.SKIN_STREAM, MessageClass.ANALOG_STREAM),
-    HEADER_B: (MessageClass.SKIN_STREAM, MessageClass.ANALOG_STREAM, MessageClass.BATTERY_STREAM),
+#: In which classes a board sends its A and its B frames, by the class that shows it: the stream,
+#: the legacy stream, and a special firmware, whose A frames are as those of the stream.
+_CLASSES: dict[int, tuple[MessageClass, MessageClass]] = {
+    MessageClass.SKIN_STREAM: (MessageClass.SKIN_STREAM, MessageClass.SKIN_STREAM),
+    MessageClass.ANALOG_STREAM: (MessageClass.ANALOG_STREAM, MessageClass.ANALOG_STREAM),
+    MessageClass.BATTERY_STREAM: (MessageClass.SKIN_STREAM, MessageClass.BATTERY_STREAM),
 }
-
-
+#: By the header of a frame, its half.
+_HALVES = {HEADER_A: 0, HEADER_B: 1}
+#: A board that has sent nothing for so many periods may send in the legacy class from then on. It
+#: pauses for fewer while it zeroes itself.
+_LEFT_PERIODS = 10
+_NEVER_NS = -(1 << 62)
 #: Classes in which boards answer.
 _ANSWERS = (MessageClass.ANALOG_COMMAND, MessageClass.MANAGEMENT)
 
@@ -123,8 +128,9 @@ class AssemblerCounters:
     """Counts all frames that did not become part of a sweep, and everything that was missing."""
 
     frames: int = 0
-    #: Frames outside the skin stream, as answers, other sensors and unconfigured nodes, and skin
-    #: frames of boards that others read.
+    #: Frames outside the skin stream, as answers, other sensors and unconfigured nodes, also those
+    #: at a board's address in a class in which it does not send, and skin frames of boards that
+    #: others read.
     other: int = 0
     #: Of the configured force/torque boards.
     force_torque: int = 0
@@ -153,6 +159,7 @@ class _Order(NamedTuple):
     Attributes:
         heads: of all frames, `HEAD_BYTES` each.
         places: of each frame, its place among the board's values.
+        first: the half of the first frame.
         missing: masks of the halves that are missing before each frame, and after the last.
         keys: what of the heads identifies the frames: identifier, DLC, and the data's header.
         n: how many frames.
@@ -166,6 +173,7 @@ class _Order(NamedTuple):
 
     heads: bytes
     places: list[int]
+    first: int
     missing: list[int]
     keys: bytes
     n: int
@@ -182,6 +190,7 @@ class _Order(NamedTuple):
         return cls(
             b"".join(heads),
             list(places),
+            1 << places[0] // 2 + places[0] % 2 * TRIANGLES,
             [*missing, 0],
             keys,
             n,
@@ -219,6 +228,8 @@ class _BoardState:
 
     Attributes:
         wanted: halves that the configured triangles send.
+        classes: of its A and of its B frames.
+        without_b: sweeps in succession that had A frames alone; of the first ones, one is enough.
         awaited: halves without which a sweep is not complete.
         missing: halves of `awaited` that have not arrived; 0 between sweeps.
         values: received bytes of each triangle, A and B in turn.
@@ -232,6 +243,9 @@ class _BoardState:
         stray: sweeps in succession with frames in another order.
         learn_after: so many sweeps pass before the order is learnt.
         crowded: see `Sweep`, since the last one that was returned.
+        first: the half with which the sweep began.
+        usual: that of the last sweep of which no half was missing; 0 while there is none.
+        amid: whether the sweep began with another half than the usual one.
         sent_last_ns, sent_before_ns: time of the last frame of the last sweep, and of the one
             before.
         missed: see `Sweep`, of the last sweep.
@@ -245,13 +259,15 @@ class _BoardState:
     close_ns: int
     wanted: int
     awaited: int
+    classes: tuple[MessageClass, MessageClass] = _CLASSES[MessageClass.SKIN_STREAM]
+    without_b: int = PATIENCE_SWEEPS - 1
     missing: int = 0
     first_ns: int = 0
-    last_ns: int = 0
+    last_ns: int = _NEVER_NS
     certain_until_ns: int = 0
     sent: int = 0
     lone: int = 0
-    sent_first_ns: int = -(1 << 62)
+    sent_first_ns: int = _NEVER_NS
     sent_last_ns: int = 0
     sent_before_ns: int = 0
     missed: int = 0
@@ -268,6 +284,9 @@ class _BoardState:
     stray: int = 0
     learn_after: int = 1
     crowded: bool = False
+    first: int = 0
+    usual: int = 0
+    amid: bool = False
 
     def unpack(self) -> None:
         """Take the payloads of the frames in `begun`."""
@@ -306,15 +325,15 @@ class Assembler:
         self._force_torque = force_torque
         self._others = others
         self._states: dict[int, _BoardState] = {}
-        # For identifier << 8 | header byte of each frame that a configured triangle may send: the
-        # board, the place among its values, and the bit in its masks.
+        # For identifier << 8 | header byte of each frame that a configured triangle sends, in the
+        # classes of its board: the board, the place among its values, and the bit in its masks.
         self._slots: dict[int, tuple[_BoardState, int, int]] = {}
         #: By the head of the frame with which they usually begin a sweep: boards of known order.
         self._first: dict[bytes, _BoardState] = {}
         #: The board whose sweep in known order the last batch has cut.
         self._cut: _BoardState | None = None
         #: No sweep in progress is too old up to here, on the clock of the frames.
-        self._none_old_until_ns = -(1 << 62)
+        self._none_old_until_ns = _NEVER_NS
         for index, board in boards:
             period_ns = board.settings.period_ms * 1_000_000
             wanted = 0
@@ -330,8 +349,9 @@ class Assembler:
                 wanted,
             )
             self._states[board.settings.address] = state
-            for triangle in board.triangles:
-                self._add_slots(board.settings.address, triangle, state)
+            self._add_slots(board.settings.address, state)
+        closes_ns = [state.close_ns for state in self._states.values()]
+        self._longest_close_ns = max(closes_ns, default=0)
 
     def feed(self, batch: FrameBatch) -> Assembled:
         """Process the frames of a batch; this is the only loop over them."""
@@ -373,30 +393,31 @@ class Assembler:
                 at += 1
                 slot = slots.get(identifier << 8 | header)
                 if slot is None or dlc < 8:
-                    if not self._usable(identifier, dlc, header):
+                    t_ns = seconds * NS_PER_S + nanoseconds
+                    if not self._usable(identifier, dlc, header, t_ns, sweeps):
                         message_class = identifier >> 8
                         if message_class in _ANSWERS:
                             answers.append((identifier, (bytes((header,)) + payload)[:dlc]))
                         elif message_class < MessageClass.ANALOG_COMMAND:
                             motors.append(identifier)
                         continue
-                    assert slot is not None
-                    # Old firmware sends no status; the bytes after the DLC are not defined.
-                    payload = payload[: TAXELS - VALUES_A] + b"\0\0"  # noqa: PLW2901
+                    slot = slots[identifier << 8 | header]
+                    if dlc < 8:
+                        # Old firmware sends no status; the bytes after the DLC are not defined.
+                        payload = payload[: TAXELS - VALUES_A] + b"\0\0"  # noqa: PLW2901
                 state, place, bit = slot
                 if state.begun:
                     state.unpack()
-                if place == state.expected and rising:
+                t_ns = seconds * NS_PER_S + nanoseconds
+                if place == state.expected and rising and state.first_ns <= t_ns:
                     taken = self._take_run(state, records, heads, at - 1, sweeps)
                     if taken:
                         at += taken - 1
                         break
-                t_ns = seconds * NS_PER_S + nanoseconds
                 if place == state.last_place and self._is_doubled(state, bit, payload, t_ns):
                     continue
-                since_ns = state.first_ns - _SET_BACK_NS
                 if (
-                    bit & state.missing and since_ns <= t_ns <= state.certain_until_ns
+                    bit & state.missing and state.first_ns <= t_ns <= state.certain_until_ns
                 ) or self._belongs(state, bit, t_ns, sweeps):
                     if state.came is not None:
                         head = heads[(at - 1) * HEAD_BYTES : at * HEAD_BYTES]
@@ -439,42 +460,45 @@ class Assembler:
             self._count_lone(state)
         return sweeps
 
-    def _add_slots(self, address: int, triangle: int, state: _BoardState) -> None:
-        for half, header in enumerate((HEADER_A, HEADER_B)):
-            for message_class in _CLASSES[header]:
-                identifier = message_class << 8 | address << 4 | triangle
-                bit = 1 << triangle + half * TRIANGLES
-                self._slots[identifier << 8 | header] = state, 2 * triangle + half, bit
+    def _add_slots(self, address: int, state: _BoardState) -> None:
+        for triangle in range(TRIANGLES):
+            if state.wanted >> triangle & 1:
+                for header, half in _HALVES.items():
+                    key = (state.classes[half] << 8 | address << 4 | triangle) << 8 | header
+                    bit = 1 << triangle + half * TRIANGLES
+                    self._slots[key] = state, 2 * triangle + half, bit
 
-    def _usable(self, identifier: int, dlc: int, header: int) -> bool:
-        """Count a frame that is not a complete one of a configured triangle.
+    def _usable(
+        self, identifier: int, dlc: int, header: int, t_ns: int, sweeps: list[Sweep]
+    ) -> bool:
+        """Count a frame that is not a complete one of a configured triangle in its board's classes.
 
-        Returns whether it is a configured triangle's B frame that only lacks its status.
+        Returns whether it is a configured triangle's after all: a B frame that only lacks its
+        status, or the first in a class in which its board sends from now on.
         """
         counters = self.counters
         message_class = identifier >> 8
+        is_skin = message_class == MessageClass.SKIN_STREAM
+        half = _HALVES.get(header)
         if identifier in self._force_torque:
             counters.force_torque += 1
         elif dlc == 0 or identifier > MAX_STANDARD_ID:
             counters.other += 1
-        elif message_class == MessageClass.SKIN_STREAM:
-            if header not in _CLASSES:
-                counters.wrong_header += 1
-            elif dlc < (_SMALLEST_DLC_B if header == HEADER_B else 8):
-                counters.short += 1
-            elif identifier << 8 | header in self._slots:
-                return True
-            else:
-                self._count_stranger(identifier)
+        elif is_skin and half is None:
+            counters.wrong_header += 1
+        elif is_skin and dlc < (_SMALLEST_DLC_B if half else 8):
+            counters.short += 1
         elif (
-            dlc == 8
-            and message_class in _CLASSES.get(header, ())
-            and not self._may_be_mais(identifier)
-        ):
-            self._count_stranger(identifier)
-        else:
+            half is None
+            or message_class not in _CLASSES
+            or message_class != _CLASSES[message_class][half]
             # Other sensors use the legacy class too, most with fewer bytes.
+            or (dlc < 8 and not is_skin)
+            or self._may_be_mais(identifier)
+        ):
             counters.other += 1
+        else:
+            return self._is_of_skin(identifier, half, t_ns, sweeps)
         return False
 
     def _may_be_mais(self, identifier: int) -> bool:
@@ -482,15 +506,61 @@ class Assembler:
         legacy = identifier >> 8 == MessageClass.ANALOG_STREAM and identifier & 0xF in MAIS_TYPES
         return legacy and identifier >> 4 & 0xF not in self._states
 
-    def _count_stranger(self, identifier: int) -> None:
-        address = identifier >> 4 & 0xF
-        if address in self._states:
-            self.counters.unknown_triangle += 1
-        elif address in self._others:
+    def _is_of_skin(self, identifier: int, half: int, t_ns: int, sweeps: list[Sweep]) -> bool:
+        """Return whether a frame with the form of a half is that of a configured triangle, in whose
+        class its board then sends; count it otherwise.
+        """
+        address, triangle = identifier >> 4 & 0xF, identifier & 0xF
+        state = self._states.get(address)
+        if state is None:
+            if address in self._others:
+                self.counters.other += 1
+            else:
+                self.counters.unknown_board += 1
+                self.unconfigured[address] += 1
+        elif not self._may_send_in(state, identifier >> 8, half, t_ns):
             self.counters.other += 1
+        elif not state.wanted >> triangle & 1:
+            self.counters.unknown_triangle += 1
         else:
-            self.counters.unknown_board += 1
-            self.unconfigured[address] += 1
+            if identifier >> 8 != state.classes[half]:
+                self._change_classes(address, identifier >> 8, sweeps)
+            return True
+        return False
+
+    @staticmethod
+    def _may_send_in(state: _BoardState, message_class: int, half: int, t_ns: int) -> bool:
+        """Return whether a frame of this class, which other sensors use too, may be of a board.
+
+        Nothing else sends in the class of the stream. So a board that does so is of the special
+        firmware only if all its B frames are missing there, and of the legacy stream only if
+        nothing comes there.
+        """
+        if message_class in (state.classes[half], MessageClass.SKIN_STREAM):
+            return True
+        if message_class == MessageClass.ANALOG_STREAM:
+            return abs(t_ns - state.last_ns) > _LEFT_PERIODS * state.period_ns
+        came = state.awaited & ~state.missing if state.missing else 0
+        return (
+            state.classes[0] == MessageClass.SKIN_STREAM
+            and state.without_b >= PATIENCE_SWEEPS
+            and not came >> TRIANGLES
+        )
+
+    def _change_classes(self, address: int, message_class: int, sweeps: list[Sweep]) -> None:
+        """A board sends in other classes from now on: nothing that came before joins it."""
+        state = self._states[address]
+        if message_class != MessageClass.BATTERY_STREAM:
+            if state.missing:
+                self._close(state, sweeps)
+            self._count_lone(state)
+            state.sent_first_ns, state.last_place = _NEVER_NS, -1
+        state.order = state.came = None
+        state.expected, state.stray, state.learn_after = -1, 0, 1
+        for key in [key for key, (of, _, _) in self._slots.items() if of is state]:
+            del self._slots[key]
+        state.classes = _CLASSES[message_class]
+        self._add_slots(address, state)
 
     def _is_doubled(self, state: _BoardState, bit: int, payload: bytes, t_ns: int) -> bool:
         """Count the frame that the board sent last, if it comes once more.
@@ -547,7 +617,14 @@ class Assembler:
         last_ns = seconds * NS_PER_S + nanoseconds
         if done:
             first_ns = state.first_ns
-            if not first_ns - _SET_BACK_NS <= last_ns <= state.certain_until_ns:
+            seconds, nanoseconds, *_ = form.unpack_from(text, begin)
+            # What is older than the first frame needs a closer look.
+            if (
+                not first_ns
+                <= seconds * NS_PER_S + nanoseconds
+                <= last_ns
+                <= state.certain_until_ns
+            ):
                 return 0
             if len(state.begun) != done * size:
                 return 0
@@ -568,9 +645,9 @@ class Assembler:
             if heads != order.heads[done * HEAD_BYTES : (done + n) * HEAD_BYTES]:
                 return 0
             if not done:
-                if first_ns > self._none_old_until_ns:
-                    self._close_old(first_ns, sweeps)
+                self._close_old(first_ns, sweeps)
                 state.first_ns = first_ns
+                state.first, state.amid = order.first, False
                 state.certain_until_ns = first_ns + min(state.pause_ns, state.close_ns)
             done += n
             state.begun += text[begin:]
@@ -599,10 +676,11 @@ class Assembler:
                 status = _spread(status, order.triangles)
         state.values[places[-1]] = payload
         state.last_place = places[-1]
+        state.usual = order.first
         state.stray = 0
         if done:
             state.begun, state.missing, state.expected = b"", 0, -1
-        elif first_ns > self._none_old_until_ns:
+        else:
             self._close_old(first_ns, sweeps)
         missed = self._count_sweep(state, last_ns)
         if state.any_absent:
@@ -639,7 +717,7 @@ class Assembler:
         size = records.form.size
         last = records.form.unpack_from(records.octets.data, (at + n - 1) * size)
         t_ns = last[0] * NS_PER_S + last[1]
-        if not state.first_ns - _SET_BACK_NS <= t_ns <= state.certain_until_ns:
+        if t_ns > state.certain_until_ns:
             return 0
         payload = records.octets[at : at + n, records.head + HEAD_BYTES : size].tobytes()
         places = order.places[done : done + n]
@@ -669,8 +747,17 @@ class Assembler:
         It may begin a sweep, which ends the one before, or belong to a triangle that was not
         awaited. Returns False if it came too late for its sweep.
         """
+        came = state.awaited & ~state.missing if state.missing else 0
+        begins = state.amid and bit == state.usual and self._is_after_late(state, came, t_ns)
+        if (
+            came.bit_count() == 1
+            and max(state.sent_last_ns, state.sent_before_ns) <= t_ns < state.first_ns
+        ):
+            # The first frame's stamp was ahead. By that, the sweep would last into the next one.
+            state.first_ns = state.last_ns = t_ns
         if state.missing and (
-            state.awaited & ~state.missing & bit
+            begins
+            or came & bit
             or t_ns > self._ends_ns(state, state.first_ns, state.last_ns)
             or t_ns < state.first_ns - _SET_BACK_NS
         ):
@@ -684,7 +771,8 @@ class Assembler:
                 state.missing |= both
         if not state.missing:
             since_ns = t_ns - state.sent_first_ns
-            if not bit & state.sent and -_SET_BACK_NS <= since_ns <= state.pause_ns:
+            is_near = -_SET_BACK_NS <= since_ns <= state.pause_ns
+            if not (bit & state.sent or begins) and is_near:
                 # Its sweep was returned without it: the triangle was not awaited, or the frame was
                 # held up for longer than a sweep is waited for.
                 self.counters.late += 1
@@ -694,13 +782,31 @@ class Assembler:
                 state.crowded = True
             if state.lone:
                 self._count_lone(state)
-            if t_ns > self._none_old_until_ns:
-                self._close_old(t_ns, sweeps)
+            self._close_old(t_ns, sweeps)
             state.missing = state.awaited
             state.first_ns = t_ns
+            state.first, state.amid = bit, state.usual not in (0, bit)
             self._expect_order(state)
-        state.certain_until_ns = self._ends_ns(state, state.first_ns, t_ns)
+        ends_ns = self._ends_ns(state, state.first_ns, t_ns)
+        if state.amid:
+            # Until then the usual first frame begins no other.
+            came = state.awaited & ~state.missing | bit
+            ends_ns = min(ends_ns, state.first_ns + self._slowest_ns(state, came))
+        state.certain_until_ns = ends_ns
         return True
+
+    def _is_after_late(self, state: _BoardState, came: int, t_ns: int) -> bool:
+        """Return whether the halves that came of a sweep in progress are of the one before, and
+        late, or stamped as if they were: that lacks them all, and no board sends so slowly.
+        """
+        if not came or came & state.sent:
+            return False
+        return abs(t_ns - state.first_ns) > self._slowest_ns(state, came)
+
+    @staticmethod
+    def _slowest_ns(state: _BoardState, came: int) -> int:
+        """Return how long the slowest board, whose sweeps take all of a period, sends so many."""
+        return came.bit_count() * state.period_ns // (2 * TRIANGLES)
 
     @staticmethod
     def _ends_ns(state: _BoardState, first_ns: int, last_ns: int) -> int:
@@ -714,6 +820,9 @@ class Assembler:
         A bus keeps the order of its frames. So what began before a pause of the reader, or of the
         bus, comes before what began after it.
         """
+        # One stamp that is far ahead does not show that none is old until then.
+        if 0 <= self._none_old_until_ns - now_ns <= self._longest_close_ns:
+            return
         sweeps += self.expire(now_ns)
         self._none_old_until_ns = min(
             (state.first_ns if state.missing else now_ns) + state.close_ns
@@ -730,6 +839,7 @@ class Assembler:
         if state.begun:
             state.unpack()
         got = state.awaited & ~state.missing
+        state.without_b = 0 if got >> TRIANGLES else state.without_b + 1
         present = got & got >> TRIANGLES
         missed = self._count_sweep(state, state.last_ns)
         values = np.frombuffer(bytearray().join(state.values), np.uint8)
@@ -749,6 +859,7 @@ class Assembler:
             if state.any_absent:
                 state.absent_for = [0] * TRIANGLES
                 state.any_absent = False
+            state.usual = state.first
             if state.came is not None:
                 self._learn_order(state, state.came)
         if present:

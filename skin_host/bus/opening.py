@@ -77,10 +77,7 @@ def _opened(name: str, bus: Bus, opening: "Future[can.BusABC]") -> can.BusABC:
     try:
         return opening.result(adapters.OPEN_S)
     except TimeoutError:
-        raise BusError(
-            f'bus "{name}": {bus.interface} {bus.channel}: has not answered for '
-            f"{adapters.OPEN_S:g} s: check its plug and power"
-        ) from None
+        raise adapters.no_answer(name, bus) from None
 
 
 def open_bus(name: str, bus: Bus) -> can.BusABC:

@@ -18,7 +18,7 @@ import termios
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -192,8 +192,8 @@ async def test_an_adapter_that_takes_nothing_holds_nobody_up(
 class Server:
     """A socketcand whose manners are given: what it answers to each of a client's messages."""
 
-    def __init__(self, answers: Callable[[int], list[bytes]]) -> None:
-        self._answers = answers
+    def __init__(self, answers: Callable[[int], Iterable[bytes]]) -> None:
+        self.answers = answers
         self._socket = socket.create_server(("127.0.0.1", 0))
         self.port = self._socket.getsockname()[1]
         self.connections = 0
@@ -206,11 +206,11 @@ class Server:
                 client, _ = self._socket.accept()
                 self.connections += 1
                 self.clients.append(client)
-                serving = (client, self._answers(self.connections))
+                serving = (client, self.answers(self.connections))
                 threading.Thread(target=self._serve, args=serving, daemon=True).start()
 
     @staticmethod
-    def _serve(client: socket.socket, answers: list[bytes]) -> None:
+    def _serve(client: socket.socket, answers: Iterable[bytes]) -> None:
         with contextlib.suppress(OSError), client:
             for answer in answers:
                 client.sendall(answer)
@@ -219,8 +219,85 @@ class Server:
             while client.recv(1000):
                 pass
 
+    def drop(self) -> None:
+        """End all connections, as when it restarts."""
+        for client in self.clients:
+            with contextlib.suppress(OSError):
+                client.shutdown(socket.SHUT_RDWR)
+
     def close(self) -> None:
         self._socket.close()
+
+
+def greets_always(connection: int) -> list[bytes]:
+    return [b"< hi >", b"< ok >", b"< ok >"]
+
+
+async def send_until(bus: Port, condition: Callable[[], bool]) -> None:
+    """Read, and send as to boards that are silent, until a condition holds."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, (bus.state, bus.unopened, bus.counters)
+        bus.read()
+        with contextlib.suppress(BusError):
+            await bus.send([(0x20E, b"\x07\x00")])
+        await asyncio.sleep(0.02)
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[Server, Callable[[], Port]]]:
+    """A server that can be changed, and what opens its bus."""
+    server = Server(greets_always)
+    options: dict[str, str | int] = {"host": "127.0.0.1", "port": server.port}
+    settings = Bus(interface="socketcand", channel="can0", options=options)
+    opened: list[Port] = []
+
+    def open_it() -> Port:
+        opened.append(open_port("left", settings, Receive()))
+        return opened[-1]
+
+    yield server, open_it
+    server.close()
+    server.drop()
+    for one in opened:
+        one.close()
+
+
+async def test_a_server_of_buses_that_restarts_is_connected_to_again(
+    served: tuple[Server, Callable[[], Port]],
+) -> None:
+    """Its library reads the end of a connection as no frame: only sending shows it."""
+    server, open_it = served
+    bus = open_it()
+    assert bus.state is LinkState.UP
+    server.drop()
+    await send_until(bus, lambda: bus.counters.reopened == 1)
+    assert bus.state is LinkState.UP
+    assert bus.counters.removals == 1
+
+
+async def test_a_server_that_does_not_answer_any_more_is_named(
+    served: tuple[Server, Callable[[], Port]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(adapters, "OPEN_S", 0.2)
+    server, open_it = served
+    bus = open_it()
+    works_again = threading.Event()
+
+    def answers(connection: int) -> Iterator[bytes]:
+        yield b"< hi >"
+        works_again.wait(PATIENCE_S)
+        yield b"< ok >"
+        yield b"< ok >"
+
+    server.answers = answers
+    server.drop()
+    await send_until(bus, lambda: bool(bus.unopened))
+    assert bus.state is LinkState.GONE
+    assert bus.unopened == "socketcand can0: has not answered for 0.2 s: check its plug and power"
+    works_again.set()
+    await send_until(bus, lambda: bus.state is LinkState.UP)
+    assert not bus.unopened
 
 
 def configuration(folder: Path, tcp_port: int) -> Path:

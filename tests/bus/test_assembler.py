@@ -134,6 +134,141 @@ def test_halves_of_two_sweeps_are_not_joined_where_a_late_frame_hides_the_pause(
     np.testing.assert_array_equal(two.raw[:4], second)
 
 
+@pytest.mark.parametrize(
+    "order", [list(range(8)), [7, 6, 5, 4, 3, 2, 1, 0], [0, 2, 4, 6, 1, 3, 5, 7]]
+)
+@pytest.mark.parametrize("at_once", [1, 3, 1000])
+@pytest.mark.parametrize("late", [0.51, 0.7, 0.9])
+def test_a_frame_that_is_late_by_most_of_a_period_joins_no_other_sweep(
+    order: list[int], at_once: int, late: float
+) -> None:
+    """It begins a sweep, which the usual first frame ends. The sweep of that is whole."""
+    assembler = make()
+    sent: list[tuple[int, bytes, int]] = []
+    numbers = range(1, 60)
+    for number in numbers:
+        swept = frames(values(4, number), number * PERIOD)
+        times = [t_ns for _, _, t_ns in swept]
+        # None of the first four, and then the second half of a triangle, or two frames.
+        if number > 4 and number % 2:
+            for place in (5, 6)[: 1 + number % 4 // 2]:
+                times[place] += round(late * PERIOD)
+        sent += [(*swept[i][:2], t_ns) for i, t_ns in zip(order, times, strict=True)]
+    sent.sort(key=lambda frame: frame[2])
+    sweeps = [
+        sweep
+        for at in range(0, len(sent), at_once)
+        for sweep in feed(assembler, sent[at:][:at_once])
+    ]
+    sweeps += assembler.flush()
+    whole = []
+    for sweep in sweeps:
+        raw = values(4, sweep.t_ns // PERIOD)
+        for triangle in range(4):
+            if sweep.present >> triangle & 1:
+                np.testing.assert_array_equal(sweep.raw[triangle], raw[triangle])
+        whole += [sweep.t_ns // PERIOD] if sweep.present == 0b1111 else []
+    assert whole == [number for number in numbers if number <= 4 or not number % 2]
+    counters = assembler.counters
+    used = 2 * sum(sweep.present.bit_count() for sweep in sweeps)
+    assert counters.frames == used + counters.halves
+    assert counters.late == counters.missed == 0
+
+
+@pytest.mark.parametrize("triangles", [1, 2])
+def test_a_board_that_changes_its_order_loses_nothing_however_slowly_it_sends(
+    triangles: int,
+) -> None:
+    """Its usual first frame comes amid a sweep of another order, and ends it not."""
+    assembler = make(f"0-{triangles - 1}")
+    for number in range(1, 40):
+        raw = values(triangles, number)
+        sent = frames(raw, number * PERIOD, spacing_ns=8 * MS)
+        if number % 3 == 0:
+            times = [t_ns for _, _, t_ns in sent]
+            sent = [(*sent[i][:2], t_ns) for i, t_ns in zip([1, 0, 2, 3], times, strict=False)]
+        (sweep,) = [one for frame in sent for one in feed(assembler, [frame])]
+        np.testing.assert_array_equal(sweep.raw[:triangles], raw)
+
+
+def test_a_board_that_changes_its_order_after_it_lost_a_frame_loses_no_other() -> None:
+    assembler = make()
+    for number in range(1, 40):
+        raw = values(4, number)
+        sent = frames(raw, number * PERIOD)
+        if number % 3 == 0:
+            times = [t_ns for _, _, t_ns in sent]
+            sent = [
+                (*sent[i][:2], t_ns) for i, t_ns in zip([1, 0, *range(2, 8)], times, strict=True)
+            ]
+        if number % 3 == 2:
+            del sent[1]
+        sweeps = feed(assembler, sent) + assembler.expire((number + 1) * PERIOD - MS)
+        assert [sweep.present for sweep in sweeps] == [0b1111 if number % 3 != 2 else 0b1110]
+
+
+@pytest.mark.parametrize("ahead_ms", [30, 45, 60, 90, 150, 3_600_000])
+@pytest.mark.parametrize("at_once", [1, 3, 1000])
+def test_a_stamp_that_is_ahead_of_its_time_joins_no_two_sweeps(ahead_ms: int, at_once: int) -> None:
+    """It begins a sweep. The next frame shows when that began; the sweep after it is whole."""
+    assembler = make()
+    sent: list[tuple[int, bytes, int]] = []
+    for number in range(1, 42):
+        swept = frames(values(4, number), number * PERIOD)
+        if number > 4 and number % 4 == 1:
+            place = number // 4 % 8
+            swept[place] = (*swept[place][:2], swept[place][2] + ahead_ms * MS)
+        sent += swept
+    sweeps = [
+        sweep
+        for at in range(0, len(sent), at_once)
+        for sweep in feed(assembler, sent[at:][:at_once])
+    ]
+    sweeps += assembler.flush()
+    raws = [values(4, number) for number in range(1, 42)]
+    whole = 0
+    for sweep in sweeps:
+        for triangle in range(4):
+            if sweep.present >> triangle & 1:
+                assert any((sweep.raw[triangle] == raw[triangle]).all() for raw in raws)
+        whole += sweep.present == 0b1111
+    # That of which the first stamp is wrong is whole, too.
+    assert whole == 41 - 10 + 1
+    counters = assembler.counters
+    used = 2 * sum(sweep.present.bit_count() for sweep in sweeps)
+    assert counters.frames == used + counters.halves
+    assert counters.late == counters.missed == 0
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 16])
+@pytest.mark.parametrize("lost", range(1, 8))
+def test_a_sweep_whose_first_stamp_is_ahead_ends_in_time_however_it_is_read(
+    at_once: int, lost: int
+) -> None:
+    """In the known order, frames that follow the first are taken together. What that sweep lacks
+    is the first that comes of the next.
+    """
+    assembler = learnt("0-3", 4)
+    sent = frames(values(4, 5), 5 * PERIOD)
+    sent[0] = (*sent[0][:2], sent[0][2] + 60 * MS)
+    del sent[lost]
+    sent += frames(values(4, 6), 6 * PERIOD)[lost:]
+    sweeps = [
+        sweep
+        for at in range(0, len(sent), at_once)
+        for sweep in feed(assembler, sent[at:][:at_once])
+    ]
+    sweeps += assembler.flush()
+    for sweep in sweeps:
+        number = sweep.t_ns // PERIOD
+        for triangle in range(4):
+            if sweep.present >> triangle & 1:
+                np.testing.assert_array_equal(sweep.raw[triangle], values(4, number)[triangle])
+    whole = 0b1111 & ~(1 << lost // 2)
+    after = [0b1111 >> (lost + 1) // 2 << (lost + 1) // 2] if lost < 7 else []
+    assert [sweep.present for sweep in sweeps] == [whole, *after]
+
+
 def test_a_status_word_comes_without_the_other_half_of_its_triangle() -> None:
     """It may be the only one that says that the chip does not answer."""
     words = np.array([0x0001, 0x0002, 0x0010, 0x0001], np.uint16)
@@ -354,6 +489,12 @@ def test_frames_in_the_usual_order_are_taken_together_with_the_same_result(data)
             ]
     sent = [frame for frame in sent if rng.random() >= harm]
     sent = [again for frame in sent for again in [frame] * (1 + (rng.random() < harm))]
+    sent = [
+        frame
+        if rng.random() >= harm
+        else (int(rng.choice([0x310, 0x610])) | frame[0] & 15, *frame[1:])
+        for frame in sent
+    ]
     alone, together = make("0-7", n_boards), make("0-7", n_boards)
     alone._take_sweep = alone._take_run = lambda *_: 0  # type: ignore[method-assign]
     expected = [sweep for frame in sent for sweep in feed(alone, [frame])]
@@ -479,13 +620,132 @@ def test_a_frame_that_is_of_no_sweep_is_counted_by_its_reason_and_once(
     assert {name: n for name, n in known.items() if n} == {"frames": 1, counted: 1}
 
 
-def test_frames_of_every_class_in_which_a_board_may_send_make_its_sweep() -> None:
-    raw = values(3)
-    sent = frames(raw, PERIOD)
-    classes = [LEGACY, LEGACY, STREAM, BATTERY, STREAM, STREAM]
-    sent = [(of << 8 | one & 0xFF, *rest) for of, (one, *rest) in zip(classes, sent, strict=True)]
-    (sweep,) = feed(make("0-2"), sent)
-    np.testing.assert_array_equal(sweep.raw[:3], raw)
+def in_classes(
+    sent: list[tuple[int, bytes, int]], *classes: wire.MessageClass
+) -> list[tuple[int, bytes, int]]:
+    """The frames of a sweep, A and B in turn, as a board sends them in these two classes."""
+    return [
+        (classes[place % 2] << 8 | can_id & 0xFF, *rest)
+        for place, (can_id, *rest) in enumerate(sent)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("classes", "first"),
+    [((STREAM, STREAM), 0), ((LEGACY, LEGACY), 0), ((STREAM, BATTERY), 1)],
+)
+@pytest.mark.parametrize("triangles", [1, 3])
+@pytest.mark.parametrize("at_once", [1, 100])
+def test_a_board_may_send_in_other_classes(
+    classes: tuple[wire.MessageClass, ...], first: int, triangles: int, at_once: int
+) -> None:
+    """That of the special firmware, which other sensors use too, is known by its first sweep."""
+    raws = [values(triangles, number) for number in range(5)]
+    sent = [
+        frame
+        for number, raw in enumerate(raws)
+        for frame in in_classes(frames(raw, number * PERIOD), *classes)
+    ]
+    assembler = make(f"0-{triangles - 1}")
+    sweeps = [
+        sweep
+        for at in range(0, len(sent), at_once)
+        for sweep in feed(assembler, sent[at:][:at_once])
+    ]
+    assert [sweep.raw[:triangles].tolist() for sweep in sweeps] == [
+        raw.tolist() for raw in raws[first:]
+    ]
+    assert assembler.counters.other == assembler.counters.halves == first * triangles
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 1000])
+@pytest.mark.parametrize("triangles", [1, 4])
+@pytest.mark.parametrize(
+    ("classes", "foreign"),
+    [
+        ((STREAM, STREAM), (LEGACY, BATTERY)),
+        ((LEGACY, LEGACY), (BATTERY,)),
+        ((STREAM, BATTERY), (LEGACY,)),
+    ],
+)
+def test_frames_in_a_class_in_which_their_board_does_not_send_are_no_halves(
+    classes: tuple[wire.MessageClass, ...],
+    foreign: tuple[wire.MessageClass, ...],
+    triangles: int,
+    at_once: int,
+) -> None:
+    """Before, within and after sweeps; a board that loses frames, in and out of the known order."""
+    rng = np.random.default_rng(5)
+    other = [
+        (identifier(of, 1, triangle), header)
+        for of in foreign
+        for triangle in range(triangles)
+        for header in ([wire.HEADER_B] if of == BATTERY else [wire.HEADER_A, wire.HEADER_B])
+    ]
+    sent: list[tuple[int, bytes, int]] = []
+    refused = 0
+    raws = {}
+    for number in range(60):
+        raw = raws[number] = values(triangles, number)
+        swept = in_classes(frames(raw, number * PERIOD), *classes)
+        if number % 5 == 4:
+            del swept[rng.integers(len(swept))]
+        if number > 1:
+            for can_id, header in rng.permutation(other)[:3].tolist():
+                place = int(rng.integers(len(swept) + 1))
+                t_ns = number * PERIOD - MS if place == 0 else swept[place - 1][2]
+                swept.insert(place, (can_id, bytes([header, *rng.bytes(7)]), t_ns))
+                refused += 1
+        sent += swept
+    assembler = make(f"0-{triangles - 1}")
+    sweeps = [
+        sweep
+        for at in range(0, len(sent), at_once)
+        for sweep in feed(assembler, sent[at:][:at_once])
+    ]
+    sweeps += assembler.flush()
+    for sweep in sweeps:
+        raw = raws[sweep.t_ns // PERIOD]
+        for triangle in range(triangles):
+            if sweep.present >> triangle & 1:
+                np.testing.assert_array_equal(sweep.raw[triangle], raw[triangle])
+    first = triangles if BATTERY in classes else 0
+    lost = 12
+    assert sum(sweep.present.bit_count() for sweep in sweeps) == 60 * triangles - lost - first
+    assert assembler.counters.other == refused + first
+    assert assembler.counters.halves == lost + first
+
+
+def test_a_board_that_begins_to_send_in_other_classes_joins_nothing_of_both() -> None:
+    """The class of the stream is believed at once; those that other sensors use, too, once the
+    board, or all its B frames, are missing from it.
+    """
+    assembler = make("0-1")
+    number = 0
+
+    def send(periods: int, *classes: wire.MessageClass) -> list[int]:
+        """Send so many sweeps; return which of them came, whole and true."""
+        nonlocal number
+        came = []
+        for sweep in range(periods):
+            number += 1
+            raw = values(2, number)
+            # Cut amid a triangle, as a set-up would.
+            sent = in_classes(frames(raw, number * PERIOD), *classes)[: 3 if sweep == 0 else 4]
+            for one in feed(assembler, sent):
+                np.testing.assert_array_equal(one.raw[0], values(2, one.t_ns // PERIOD)[0])
+                if one.present == 0b11:
+                    np.testing.assert_array_equal(one.raw[:2], raw)
+                    came.append(sweep)
+        return came
+
+    assert send(4, LEGACY, LEGACY) == [1, 2, 3]
+    assert send(4, STREAM, STREAM) == [1, 2, 3]
+    assert send(9, STREAM, BATTERY) == [3, 4, 5, 6, 7, 8]
+    assert send(4, STREAM, STREAM) == [1, 2, 3]
+    assert send(9, LEGACY, LEGACY) == []
+    assert send(4, LEGACY, LEGACY) == [1, 2, 3]
+    assert send(5, STREAM, BATTERY) == [3, 4]
 
 
 def test_answers_are_handed_on_with_the_bytes_that_they_have() -> None:
@@ -547,13 +807,19 @@ def test_a_sweep_expires_once_it_is_older_than_its_share_of_a_period() -> None:
     assert assembler.expire(10 * PERIOD) == []
 
 
+@pytest.mark.parametrize("ahead_ns", [0, 3600 * 1000 * MS])
 @pytest.mark.parametrize("first", [0, 5])
-def test_what_began_before_a_pause_comes_before_what_began_after_it(first: int) -> None:
-    """A reader that was held up joins boards' sweeps as they come, whatever it reads at once."""
+def test_what_began_before_a_pause_comes_before_what_began_after_it(
+    first: int, ahead_ns: int
+) -> None:
+    """A reader that was held up joins boards' sweeps as they come, whatever it reads at once. A
+    sweep that was stamped an hour ahead changes nothing about that.
+    """
     assembler = make(boards=2)
     for number in range(1, 4):
         for board in (1, 2):
-            feed(assembler, frames(values(4), number * PERIOD, board))
+            stamp_ns = number * PERIOD + (ahead_ns if (number, board) == (2, 2) else 0)
+            feed(assembler, frames(values(4), stamp_ns, board))
     before, after = 4 * PERIOD, 24 * PERIOD
     sent = [*frames(values(4), before, 1)[:5], *frames(values(4), after, 2)]
     sent += frames(values(4), after + 5 * MS, 1)
