@@ -18,6 +18,7 @@ from skin_host.config.explain import explain
 from skin_host.config.settings import Settings
 from skin_host.daemon import service
 from skin_host.daemon.calibrate import touched_meanwhile
+from skin_host.daemon.keeper import Keeper
 from skin_host.daemon.state import NodeState, Thresholds
 from skin_host.errors import BusError, RequestError, SkinError, StateError
 from skin_host.layout import Layout
@@ -86,7 +87,7 @@ class _Node(Protocol):
     engine: Engine
     publisher: Publisher
     thresholds: Thresholds
-    unkept: dict[str, str]
+    keeper: Keeper
 
     @property
     def is_reloading(self) -> bool: ...
@@ -97,7 +98,6 @@ class _Node(Protocol):
     def enable(self, part: int) -> None: ...
     def set_thresholds(self, thresholds: Thresholds) -> None: ...
     def status(self) -> Mapping[str, Any]: ...
-    def keep(self, state: NodeState) -> None: ...
 
 
 class Control:
@@ -106,7 +106,6 @@ class Control:
     def __init__(self, daemon: _Node) -> None:
         self._daemon = daemon
         self.recorder: FrameRecorder | None = None
-        self._keeping = asyncio.Lock()
         self._starting = asyncio.Lock()
         self._commands: dict[str, Callable[[bytes], Awaitable[Answer]]] = {
             "calibrate": self._calibrate,
@@ -171,7 +170,7 @@ class Control:
             boards = list(layout.parts[self._part(request.part)].boards)
         seconds = request.seconds or daemon.settings.processing.calibration.seconds
         answer = await self.calibrate(seconds, boards)
-        return {**answer, "kept": "calibration" not in daemon.unkept}
+        return {**answer, "kept": "calibration" not in daemon.keeper.unkept}
 
     async def _status(self, payload: bytes) -> Answer:
         _decode(payload, _Request)
@@ -185,12 +184,12 @@ class Control:
     async def _disable(self, payload: bytes) -> Answer:
         name = _decode(payload, _Parts).part
         self._daemon.disable(self._part(name))
-        return await self.keep()
+        return await self._keep()
 
     async def _enable(self, payload: bytes) -> Answer:
         name = _decode(payload, _Parts).part
         self._daemon.enable(self._part(name))
-        return await self.keep()
+        return await self._keep()
 
     async def _set_thresholds(self, payload: bytes) -> Answer:
         request = _decode(payload, _Thresholds)
@@ -200,7 +199,7 @@ class Control:
             known = {} if request.reset else msgspec.structs.asdict(daemon.thresholds)
             wanted = known | {key: value for key, value in changes.items() if value is not None}
             daemon.set_thresholds(Thresholds(**wanted))
-        answer = dict(await self.keep()) if request.reset or request.set is not None else {}
+        answer = dict(await self._keep()) if request.reset or request.set is not None else {}
         touch = msgspec.to_builtins(daemon.settings.processing.touch)
         pipeline = daemon.engine.pipeline
         decides = {
@@ -264,20 +263,15 @@ class Control:
             "ended": recorder.ended,
         }
 
-    async def keep(self) -> Answer:
+    async def _keep(self) -> Answer:
         """Store what operators changed; report it if that failed. The disk may be slow."""
         daemon = self._daemon
-        async with self._keeping:  # the newest is written last
-            state = NodeState(
-                disabled=[daemon.layout.parts[i].name for i in sorted(daemon.engine.disabled)],
-                thresholds=daemon.thresholds,
-            )
-            answer: dict[str, Any] = {"disabled": state.disabled, "kept": True}
-            try:
-                await daemon.clock.in_thread(daemon.keep, state)
-            except OSError:
-                answer["kept"] = False
-        return answer
+        state = NodeState(
+            disabled=[daemon.layout.parts[i].name for i in sorted(daemon.engine.disabled)],
+            thresholds=daemon.thresholds,
+        )
+        kept = await daemon.keeper.keep_state(state)
+        return {"disabled": state.disabled, "kept": kept}
 
     def _parts(self) -> dict[str, int]:
         """Return the indices of the node's parts by their names."""

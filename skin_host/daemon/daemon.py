@@ -2,8 +2,6 @@
 
 import asyncio
 import logging
-import os
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,21 +15,15 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings, load, needs_restart, skin_hash
 from skin_host.daemon import metrics, service
-from skin_host.daemon.calibrate import collect, keep_former
+from skin_host.daemon.calibrate import collect
 from skin_host.daemon.control import Control
-from skin_host.daemon.lasting import LastingTouches
+from skin_host.daemon.joining import NodeMemory
+from skin_host.daemon.keeper import Keeper
 from skin_host.daemon.link import Link, OpenPort
-from skin_host.daemon.memory import NodeMemory, known_of, remembered_with
-from skin_host.daemon.state import (
-    NodeState,
-    Thresholds,
-    Zeros,
-    baselines_of,
-    kept_path,
-    taxels_of,
-)
+from skin_host.daemon.memory import remembered_with
+from skin_host.daemon.state import Thresholds
+from skin_host.daemon.zeros import go_on_from
 from skin_host.errors import ConfigurationError, RequestError, SkinError, StateError
-from skin_host.files import refuse_other_robot, write_document
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.fingertip.service import FingertipPublisher
 from skin_host.health import FaultLog, HealthWatch, Record
@@ -45,7 +37,6 @@ from skin_host.mqtt.publisher import Connect, Publisher
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration, Verdict, by_part
 from skin_host.processing.calibration.calibrator import going_on
-from skin_host.processing.calibration.file import find_calibration, save_calibration
 from skin_host.processing.calibration.run import SHORTEST_S
 from skin_host.processing.core import Engine, Output
 from skin_host.tasks import cancel
@@ -56,14 +47,8 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.1
 #: ... otherwise this often.
 HEALTH_S = 1.0
-#: What is kept in files.
-_KEPT = ("calibration", "state", "zeros")
 #: Faults that are expected while a calibration is being taken.
 _UNTIL_CALIBRATED = {"part_not_calibrated", "fingertip_not_calibrated"}
-#: The end waits so long for a file that is being written.
-KEEPING_S = 2.0
-#: What could not be written, or was removed since, is written again after this time.
-AGAIN_S = 10.0
 #: Readiness is reported after the first sweeps, or after this time without them.
 PATIENCE_S = 3.0
 
@@ -90,8 +75,7 @@ class Daemon:
     Attributes:
         settings, layout: in use, with the changes that operators made.
         thresholds: these changes.
-        unkept: what could not be written to the state directory (`calibration`, `state`, `zeros`),
-            and why.
+        keeper: of its files.
 
     Raises:
         ConfigurationError: no part belongs to this node, or python-can does not know the kind
@@ -132,18 +116,8 @@ class Daemon:
             i for i in self.engine.parts if layout.parts[i].name in state.disabled
         }
         self.engine.touch_only = _touch_only(settings, layout, self.engine.parts)
-        self._zeros = memory.zeros
-        doubted = np.zeros(layout.n_taxels, np.bool_)
-        touched = taxels_of(layout, self._zeros.touched)
-        self.engine.zeros.expect_touched(touched)
-        self._touches = LastingTouches(_boards_of(layout), touched)
-        if calibration is not None:
-            self._use_baselines()
-            doubted = taxels_of(layout, self._zeros.unknown)
-            self.engine.zeros.doubt(doubted)
-        # Whatever calibration is in use: it is the chip's fault.
-        self.engine.expect_stuck(taxels_of(layout, self._zeros.stuck))
-        self.engine.zeros.hold(self.engine.boards)
+        doubted = go_on_from(memory.zeros, self.engine)
+        self.keeper = Keeper(self.engine, node, memory, clock)
         self.health = HealthWatch(self.engine)
         self.control = Control(self)
         self.publisher = Publisher(
@@ -161,14 +135,10 @@ class Daemon:
         for i in self.engine.parts:
             # The state that the broker retained from an earlier start is no longer known.
             self.publisher.put_contact(layout.parts[i].name, "UNKNOWN")
-        self._doubt_contacts(doubted | touched, self.engine.parts)
+        self._doubt_contacts(doubted, self.engine.parts)
         self.fingertips = FingertipPublisher(self.engine.fingertips, self.publisher)
         self.link = Link(self.engine, wait=True, open_port=open_port, clock=clock)
-        self.unkept = dict(memory.unkept)
-        #: Files of this node that were found or written.
-        self._files = {what for what in _KEPT if os.access(self._path(what), os.F_OK)}
         self._calibration_lock = asyncio.Lock()
-        self._saving = asyncio.Lock()
         self._reloading = asyncio.Lock()
         #: How many reloads have begun, and why the last one failed.
         self._reloads = 0
@@ -178,11 +148,7 @@ class Daemon:
         self._fed_s = 0.0
         self._status_s = 0.0
         self._fault_log = FaultLog()
-        self._keeping: asyncio.Task[None] | None = None
-        #: How many of the zeros found are kept; and which change of what is known of zeros the
-        #: contacts know.
-        self._zeros_kept = 0
-        self._writing_zeros = threading.Lock()
+        #: Which change of what is known of zeros the contacts know.
         self._zero_changes = self.engine.zeros.changes
 
     async def run(self, stop: asyncio.Event, *, calibrate: bool = False) -> None:
@@ -207,7 +173,7 @@ class Daemon:
             ),
             asyncio.create_task(self._start(calibrate), name="start"),
             asyncio.create_task(self._housekeep(), name="housekeeping"),
-            asyncio.create_task(self._keep_again(), name="keep again"),
+            asyncio.create_task(self.keeper.keep_again(), name="keep again"),
         ]
         if self.settings.service.metrics_port:
             serving = metrics.serve(self.settings.service.metrics_port, self.status, self.clock)
@@ -225,9 +191,7 @@ class Daemon:
             for part in self.engine.parts:
                 self._end_contacts(part)
             self.fingertips.end(self.clock.now_ns())
-            if self._keeping is not None:
-                await asyncio.wait([self._keeping], timeout=KEEPING_S)
-            await self._keep_zeros(touched=True)
+            await self.keeper.end()
             await self.link.stop()
 
     async def _stopped(self, stop: asyncio.Event) -> None:
@@ -252,11 +216,7 @@ class Daemon:
             raise StateError("a calibration is being taken already; wait for it to end")
         async with self._calibration_lock:
             # Gains and curves are the file's: another program may have fitted them meanwhile.
-            path = self._path("calibration")
-            await self.clock.in_thread(refuse_other_robot, path, self.layout.robot, "calibration")
-            before = await self.clock.in_thread(
-                find_calibration, path, self.layout, self.engine.configuration
-            )
+            before = await self.keeper.stored()
             log.info("calibrating for %g s: keep the skin untouched", max(seconds, SHORTEST_S))
             found = await collect(lambda: self.engine, seconds, clock=self.clock)
             known = self.engine.calibration
@@ -268,7 +228,7 @@ class Daemon:
             if before is not None:
                 if known is None:
                     # What was known of boards that do not send goes on, as with `skin calibrate`.
-                    found = going_on(found, known_of(before, self._zeros, self.layout))
+                    found = going_on(found, self.keeper.known(before))
                     found = calibrations.with_zeros(found, before.zeros | found.zeros)
                 found = calibrations.with_pressures_of(found, before)
             for name, taxels in calibrations.unchanged(found, self.layout).items():
@@ -286,19 +246,10 @@ class Daemon:
                     name,
                 )
             self.engine.use(found, boards)
-            self._touches.calibrated(measured)
             use_measurements(self._contacts, self.engine)
-            if known is not None and boards is not None:
-                # The other boards keep their zeros, whichever of the two a start finds.
-                await self._kept()
-                keeping = self._keep_zeros(before=known, doubted=doubted)
-                self._keeping = asyncio.create_task(keeping, name="keep zeros")
-                await self._kept()
-            if before is None:
-                await self.clock.in_thread(
-                    keep_former, path, self.layout, self.engine.configuration
-                )
-            await self._save_calibration()
+            # The other boards keep their zeros.
+            former = known if boards is not None else None
+            await self.keeper.keep_calibration(measured, former, doubted)
             self._put_info(await self.clock.in_thread(self._info))
             return found
 
@@ -396,20 +347,6 @@ class Daemon:
         log.info("%s read again", self._configuration)
         self._put_info(await self.clock.in_thread(self._info))
 
-    def keep(self, state: NodeState) -> None:
-        """Write what operators changed to the state directory.
-
-        Raises:
-            OSError: it cannot be written.
-        """
-        try:
-            named = msgspec.structs.replace(state, robot=self.layout.robot)
-            write_document(self._path("state"), named)
-        except OSError as error:
-            self._note_unkept("state", error)
-            raise
-        self._note_kept("state")
-
     def records(self) -> dict[str, Record]:
         """The health record of every part, as it is now."""
         return {self.layout.parts[part].name: self._record_of(part) for part in self.engine.parts}
@@ -426,6 +363,7 @@ class Daemon:
         self.settings, self.layout, self.engine = settings, layout, engine
         self.link.use(engine)
         self.health.use(engine)
+        self.keeper.use(engine)
         use_measurements(self._contacts, self.engine)
 
     def _doubt_contacts(self, taxels: NDArray[np.bool_], parts: list[int]) -> None:
@@ -441,36 +379,41 @@ class Daemon:
         self.publisher.put_contact(self.layout.parts[part].name, self._contacts[part].stop(events))
 
     async def _start(self, calibrate: bool) -> None:
-        """Bring the boards up, and calibrate if necessary; no bus waits for one that is away."""
+        """Bring the boards up, and calibrate what no calibration has measured; none waits for one
+        that is away.
+        """
         async with asyncio.TaskGroup() as group:
             ready = group.create_task(self._report_ready())
-            bringing = group.create_task(self.link.bring_up())
-            while not self.link.is_set_up():
-                await asyncio.wait([bringing], timeout=0.05)
-            await ready
-            while calibrate or self.engine.calibration is None:
-                away = self.link.away()
-                if await self._try_to_calibrate():
-                    for bus in away:
-                        group.create_task(self._calibrate_late(bus))
-                    break
+            group.create_task(self.link.bring_up())
+            if calibrate or self.engine.calibration is None:
+                await self.link.until_set_up()
+                await ready
+                while calibrate or self.engine.calibration is None:
+                    if await self._try_to_calibrate():
+                        break
+            await self._calibrate_late()
         await asyncio.Event().wait()
 
-    async def _calibrate_late(self, bus: str) -> None:
-        """Calibrate the boards of a bus that was away when all others were calibrated, once they
-        are set up, unless somebody has done that.
-        """
-        while bus in self.link.away() or self._calibration_lock.locked():
-            await self.clock.sleep(HEALTH_S)
-        while (boards := self._not_calibrated(bus)) and not await self._try_to_calibrate(boards):
-            pass
+    async def _calibrate_late(self) -> None:
+        """Calibrate boards that no calibration has measured once they send, unless somebody does.
 
-    def _not_calibrated(self, bus: str) -> list[int]:
-        """Return the boards of a bus of which no taxel has a usable zero."""
-        found, layout = self.engine.calibration, self.layout
-        assert found is not None
-        mine = [board for board in self.engine.boards if layout.boards[board].settings.bus == bus]
-        return [board for board in mine if not (found.usable & layout.taxels_of([board])).any()]
+        One that could not be calibrated then is tried again when it has been set up or away.
+        """
+        tried: set[tuple[int, int]] = set()
+        while self._unmeasured():
+            await self.clock.sleep(HEALTH_S)
+            sending = {(one, n) for one in self._unmeasured() if (n := self.link.set_ups(one))}
+            tried &= sending
+            if sending - tried and not self._calibration_lock.locked():
+                tried |= sending
+                await self._try_to_calibrate(sorted(board for board, _ in sending))
+
+    def _unmeasured(self) -> list[int]:
+        """Return the boards of which the calibration in use has measured no taxel."""
+        assert self.engine.calibration is not None
+        measured = self.engine.calibration.verdict < Verdict.ABSENT
+        boards, taxels_of = self.engine.boards, self.layout.taxels_of
+        return [board for board in boards if not (measured & taxels_of([board])).any()]
 
     async def _try_to_calibrate(self, boards: list[int] | None = None) -> bool:
         """Calibrate all, or boards by their index, and return True; or log why not, and pause."""
@@ -531,19 +474,11 @@ class Daemon:
         said_s = dict.fromkeys(self.engine.parts, 0.0)
         of_parts: dict[tuple[str, str], str] = {}
         pulse: tuple[object, ...] = ()
-        zeroed, stuck = self.engine.zeros.changes, self.engine.intake.liveness.stuck.tobytes()
         while True:
             await self.clock.sleep(LOOK_S)
             self.link.supervise()
-            engine = self.engine
-            stuck_before, stuck = stuck, engine.intake.liveness.stuck.tobytes()
             now_s = self.clock.monotonic_s()
-            touches_changed = self._note_touches(now_s)
-            if touches_changed or zeroed != engine.zeros.changes or stuck != stuck_before:
-                zeroed = engine.zeros.changes
-                # At once: what was pressed then, what lasts, and what is stuck, must be doubted
-                # after a crash, too.
-                self._begin_to_keep_zeros()
+            self.keeper.look(now_s)
             link = self.link
             self.health.tick(link.read_ns, link.ports, link.boards, link.longest_pause_ns())
             told = self.fingertips.publish_health(self.link.read_ns)
@@ -569,7 +504,6 @@ class Daemon:
             self._fault_log.note(told, now_s)
             if now_s - self._status_s >= HEALTH_S:
                 self._status_s = now_s
-                self._begin_to_keep_zeros()
                 service.notify("STATUS=" + self._status(len(told)))
 
     def _pulse(self) -> tuple[object, ...]:
@@ -579,175 +513,14 @@ class Daemon:
             *self.health.pulse(self.link.ports, self.link.boards),
             (output.connected, output.last_error, output.touches_dropped, output.refused),
             (tuple(output.withheld), tuple(output.unsubscribed)),
-            (output.name_taken, tuple(self.unkept)),
+            (output.name_taken, tuple(self.keeper.unkept)),
         )
-
-    def _note_touches(self, now_s: float) -> bool:
-        """Note which touches last; return whether that has changed."""
-        engine = self.engine
-        if not (engine.ledger.any_silent or self._touches.is_due(now_s)):
-            return False
-        silent = [board for board in engine.boards if engine.ledger.silent_ns(board)]
-        return self._touches.look(engine.zeros.touched(), engine.layout.taxels_of(silent), now_s)
-
-    def _under_way(self) -> asyncio.Task[None] | None:
-        """Return the task that is writing the zeros; None if none is."""
-        return None if self._keeping is None or self._keeping.done() else self._keeping
-
-    def _begin_to_keep_zeros(self) -> None:
-        if self._under_way() is None:
-            self._keeping = asyncio.create_task(self._keep_zeros(), name="keep zeros")
-
-    async def _kept(self) -> None:
-        """Wait until the zeros are not being written."""
-        while (writing := self._under_way()) is not None:
-            await asyncio.wait([writing])
-
-    def _use_baselines(self) -> None:
-        """Continue from the baselines that were kept: boards send with these zeros."""
-        pipeline = self.engine.pipeline
-        assert pipeline is not None
-        for part, kept in baselines_of(self.layout, self._zeros.baselines):
-            pipeline.set_zero(np.arange(part.start, part.stop, dtype=np.int32), kept)
-
-    def _baselines(self) -> dict[str, list[float]]:
-        pipeline = self.engine.pipeline
-        assert pipeline is not None
-        return {
-            part.name: np.round(pipeline.baseline[part.start : part.stop], 2).tolist()
-            for part in map(self.layout.parts.__getitem__, self.engine.parts)
-        }
-
-    def _numbers(self, taxels: NDArray[np.bool_]) -> dict[str, list[int]]:
-        """Return the numbers of some taxels, bool[n], by part."""
-        if not taxels.any():
-            return {}
-        parts = [self.layout.parts[part] for part in self.engine.parts]
-        numbers = {
-            part.name: np.flatnonzero(taxels[part.start : part.stop]).tolist() for part in parts
-        }
-        return {name: mine for name, mine in numbers.items() if mine}
-
-    async def _keep_zeros(
-        self,
-        *,
-        touched: bool = False,
-        before: Calibration | None = None,
-        doubted: NDArray[np.bool_] | None = None,
-    ) -> None:
-        """Write which zeros are not known, or with `touched` will not be, and new baselines, if
-        that has changed.
-
-        Args:
-            touched: the daemon ends, and what is touched now will not be known.
-            before: the calibration of which that in use has renewed some boards, while its file may
-                still be the one that a start finds.
-            doubted: bool[n], taxels whose zero was not known by that one.
-        """
-        engine, found = self.engine, self.engine.calibration
-        if found is None:
-            return
-        at_risk = engine.zeros.at_risk(touched)
-        if doubted is not None:
-            at_risk |= doubted
-        unknown, stuck = self._numbers(at_risk), self._numbers(engine.stuck())
-        lasting = engine.zeros.touched() if touched else self._touches.kept
-        pressed = self._numbers(engine.zeros.pressed() | lasting)
-        baselines, n_found = self._zeros.baselines, engine.zeros.found
-        calibrated = bool(baselines) and self._zeros.calibration != found.id
-        if touched or calibrated or n_found != self._zeros_kept:
-            baselines = self._baselines()
-        zeros = Zeros(
-            calibration=found.id,
-            before="" if before is None else before.id,
-            unknown=unknown,
-            touched=pressed,
-            stuck=stuck,
-            baselines=baselines,
-            written=self._zeros.written,
-            robot=self._zeros.robot,
-            parts=self._zeros.parts,
-        )
-        # The end does not leave it to a write that may not have ended.
-        is_open = "zeros" in self.unkept or (touched and self._under_way() is not None)
-        was = self._zeros
-        is_empty = not (unknown or pressed or stuck or baselines)
-        is_empty &= not (was.unknown or was.touched or was.stuck)
-        is_news = zeros != self._zeros and not is_empty
-        if not (is_news or is_open):
-            self._zeros_kept = n_found
-            return
-        zeros.written = self.clock.today().isoformat(timespec="seconds")
-        # What is being written counts as known: what is asked for later is written after it.
-        self._zeros = zeros
-        try:
-            await self.clock.in_thread(self._write_zeros, zeros)
-        except OSError as error:
-            self._note_unkept("zeros", error)
-            return
-        self._note_kept("zeros")
-        self._zeros_kept = n_found
-
-    def _write_zeros(self, zeros: Zeros) -> None:
-        """Write these zeros, unless others were to be written meanwhile. In a thread: a disk that
-        stalls may have taken the ones before only when the daemon ends.
-        """
-        with self._writing_zeros:
-            if zeros is self._zeros:
-                write_document(self._path("zeros"), zeros)
-
-    async def _save_calibration(self) -> None:
-        """Write the calibration in use. If that fails it is used anyway, until a restart."""
-        async with self._saving:  # the newest is written last
-            found = self.engine.calibration
-            if found is None:
-                return
-            path = self._path("calibration")
-            try:
-                await self.clock.in_thread(save_calibration, path, found, self.layout)
-            except OSError as error:
-                self._note_unkept("calibration", error)
-            else:
-                self._note_kept("calibration")
-                log.info("calibration %s kept in %s", found.id, path)
-
-    def _note_unkept(self, what: str, error: OSError) -> None:
-        reason = f"{self._path(what)}: {error.strerror}"
-        if what not in self.unkept:
-            log.error("%s not kept: %s", what, reason)
-        self.unkept[what] = reason
-
-    def _note_kept(self, what: str) -> None:
-        self.unkept.pop(what, None)
-        self._files.add(what)
-
-    async def _keep_again(self) -> None:
-        """Write again what could not be written, and what somebody removed with its folder."""
-        while True:
-            await self.clock.sleep(AGAIN_S)
-            removed = await self.clock.in_thread(self._removed)
-            for what in removed:
-                log.warning("%s: was removed; it is written again", self._path(what))
-            wanted = removed | self.unkept.keys()
-            if "calibration" in wanted and not self._calibration_lock.locked():
-                await self._save_calibration()
-            if "state" in wanted:
-                await self.control.keep()
-            if "zeros" in removed:
-                await self._kept()
-                self._zeros = msgspec.structs.replace(self._zeros, calibration="")
-                self._begin_to_keep_zeros()
-
-    def _removed(self) -> set[str]:
-        """Return what was kept and whose file has been removed."""
-        kept = self._files - self.unkept.keys()
-        return {what for what in kept if not os.access(self._path(what), os.F_OK)}
 
     def _record_of(self, part: int) -> Record:
         link = self.link
         output = msgspec.to_builtins(self.publisher.counters)
         record = self.health.record(
-            part, link.read_ns, link.ports, link.boards, output, self.unkept
+            part, link.read_ns, link.ports, link.boards, output, self.keeper.unkept
         )
         record["log_lines_lost"] = self._log_lines_lost()
         return record
@@ -780,15 +553,6 @@ class Daemon:
             parts=self.settings.parts,
             fingertips=self.settings.fingertips,
         )
-
-    def _path(self, what: str) -> Path:
-        """Return a file of this node's state."""
-        return kept_path(self.settings, self._node, what)
-
-
-def _boards_of(layout: Layout) -> NDArray[np.int64]:
-    """Return the board of each taxel, int64[n]."""
-    return np.array([triangle.board for triangle in layout.triangles], np.int64)[layout.triangle_of]
 
 
 def _touch_only(settings: Settings, layout: Layout, parts: list[int]) -> set[int]:

@@ -111,6 +111,8 @@ class Link:
         #: be so far, and are tried again.
         self._untried: set[Boards | StrainBoards] = set()
         self._failing: set[Boards | StrainBoards] = set()
+        #: Set whenever one of these changes.
+        self._tried = asyncio.Event()
         fingertips = engine.fingertips
         settings, layout = engine.settings, engine.layout
         periods_ns = {i: layout.boards[i].settings.period_ms * 1_000_000 for i in engine.boards}
@@ -402,18 +404,30 @@ class Link:
         """
         await asyncio.gather(*(self._bring_up(boards) for boards in self._all_boards()))
 
-    def is_set_up(self) -> bool:
-        """Whether all boards are set up that a calibration of all has to wait for: not those of
-        buses that are away, while others are received; but fingertips get no zero later.
+    async def until_set_up(self) -> None:
+        """Wait until all boards are set up that a calibration of all has to wait for: not those of
+        buses that are away, while there are others; but fingertips get no zero later.
         """
+        while not self._is_set_up():
+            self._tried.clear()
+            await self._tried.wait()
+
+    def _is_set_up(self) -> bool:
         if self._untried or not self._failing.isdisjoint(self.force_torque.values()):
             return False
-        ready = [boards for boards in self.boards.values() if boards not in self._failing]
-        return not self._failing or any(any(self._sweeps_of(one).values()) for one in ready)
+        with_boards = {boards for boards in self.boards.values() if boards.records}
+        return not with_boards or not with_boards <= self._failing
 
-    def away(self) -> set[str]:
-        """Return the buses whose boards could not be set up yet."""
-        return {bus for bus, boards in self.boards.items() if boards in self._failing}
+    def set_ups(self, board: int) -> int:
+        """Return how often a board, by its index, has been set up; 0 if no values of its pads come
+        since.
+        """
+        known, ledger = self._engine.layout.boards[board].settings, self._engine.ledger
+        record, row = self.boards[known.bus].records[known.address], ledger.row[board]
+        answering = ledger.present[row] & (ledger.error[row] == 0)
+        if ledger.is_silent(row) or not (ledger.since_set_up(row) and answering.any()):
+            return 0
+        return record.configurations
 
     async def set_up(self, boards: list[int]) -> None:
         """Send boards, by index, their set-up again and start them.
@@ -463,10 +477,12 @@ class Link:
                     await boards.bring_up()
                 self._failing.discard(boards)
                 self._untried.discard(boards)
+                self._tried.set()
                 return
             except BusError as error:
                 self._failing.add(boards)
                 self._untried.discard(boards)
+                self._tried.set()
                 if str(error) != told:
                     log.warning("%s", error)
                     told = str(error)

@@ -13,6 +13,7 @@ import socket
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from skin_host.acceptor import accept
 from skin_host.clock import SYSTEM, Clock
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.health import Record
@@ -148,17 +149,15 @@ async def serve(port: int, records: Callable[[], Records], clock: Clock = SYSTEM
             busy -= 1
 
     begin = in_tasks(answer)
+
+    async def take(connection: socket.socket) -> None:
+        begin(*await asyncio.open_connection(sock=connection, limit=MAX_REQUEST_BYTES))
+
     said = False
     while True:
         try:
             with socket.create_server(("127.0.0.1", port)) as listening:
-                listening.setblocking(False)
-                # asyncio's server, where no more files may be open, tries as often as its queue is
-                # long, and multiplies these tries each second.
-                while True:
-                    connection, _ = await asyncio.get_running_loop().sock_accept(listening)
-                    begin(*await asyncio.open_connection(sock=connection, limit=MAX_REQUEST_BYTES))
-                    said = False
+                await accept(listening, take, f"metrics on 127.0.0.1:{port}", clock)
         except OSError as error:
             if not said:
                 said = True

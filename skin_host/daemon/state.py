@@ -110,10 +110,17 @@ class Zeros(Struct, forbid_unknown_fields=True):
 
         One that somebody has put back has not, nor one whose zero comes from a recording.
         """
-        try:
-            return datetime.fromisoformat(self.written) < datetime.fromisoformat(time)
-        except (ValueError, TypeError):  # no times, or one without its zone
-            return False
+        written_s, time_s = seconds_of(self.written), seconds_of(time)
+        return written_s is not None and time_s is not None and written_s < time_s
+
+
+def seconds_of(time: str) -> float | None:
+    """Return an ISO 8601 time with its zone in s since 1970; None if it is none."""
+    try:
+        moment = datetime.fromisoformat(time)
+        return moment.timestamp() if moment.tzinfo is not None else None
+    except (ValueError, OverflowError):
+        return None
 
 
 def taxels_of(layout: Layout, numbers: Mapping[str, list[int]]) -> NDArray[np.bool_]:

@@ -19,12 +19,14 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import Server, ServerConnection
 from websockets.datastructures import Headers, MultipleValuesError
 from websockets.exceptions import ConnectionClosed
 from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
+from websockets.server import ServerProtocol
 
+from skin_host.acceptor import accept
 from skin_host.client import SkinClient, Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.mqtt.address import Broker
@@ -116,6 +118,15 @@ class _Visit(ServerConnection):
             self.transport.resume_reading()
 
 
+class _Pages(Server):
+    """The server as `websockets.serve` makes it up to version 16, but `accept` accepts its
+    connections: that of asyncio below it never begins to.
+    """
+
+    def is_serving(self) -> bool:
+        return self.close_task is None
+
+
 class Viewer:
     """The page of one robot.
 
@@ -155,28 +166,39 @@ class Viewer:
         logger = logging.getLogger("websockets.server")
         logger.setLevel(logging.WARNING)
         logger.addFilter(_is_no_idle_visit)
-        try:
-            server = await serve(
-                self._talk,
-                host,
-                port,
-                process_request=lambda connection, request: self._answer(request),
-                max_size=MAX_REQUEST_BYTES,
-                compression=None,
-                server_header=None,
-                create_connection=_Visit,
-            )
-        except (OSError, OverflowError, UnicodeError) as error:
-            raise SkinError(
-                f"the page cannot be served on {host}:{port}: {_why_not(error)}"
-            ) from None
-        async with server:
-            listening = asyncio.create_task(self._listen(), name="viewer")
+        server = _Pages(
+            self._talk,
+            process_request=lambda connection, request: self._answer(request),
+            server_header=None,
+        )
+
+        def visit() -> _Visit:
+            return _Visit(ServerProtocol(max_size=MAX_REQUEST_BYTES), server)
+
+        loop = asyncio.get_running_loop()
+        with contextlib.ExitStack() as ports:
             try:
-                yield f"http://{_shown(host)}:{_port(server)}/"
-            finally:
-                await cancel(listening)
-                await self._recording.close()
+                bound = await loop.create_server(visit, host, port, start_serving=False)
+                ports.callback(bound.close)
+                server.wrap(bound)
+                listening = [ports.enter_context(one.dup()) for one in bound.sockets]
+                for one in listening:
+                    one.listen()
+            except (OSError, OverflowError, UnicodeError) as error:
+                raise SkinError(
+                    f"the page cannot be served on {host}:{port}: {_why_not(error)}"
+                ) from None
+            take = partial(loop.connect_accepted_socket, visit)
+            what = f"the page on {host}:{_port(server)}"
+            async with server:
+                works = [self._listen(), *(accept(one, take, what) for one in listening)]
+                working = [asyncio.create_task(work, name="viewer") for work in works]
+                try:
+                    yield f"http://{_shown(host)}:{_port(server)}/"
+                finally:
+                    await cancel(*working)
+                    ports.close()
+                    await self._recording.close()
 
     async def run(
         self, stop: asyncio.Event, host: str, port: int, ready: Callable[[str], None]
@@ -363,9 +385,10 @@ def _why_not(error: Exception) -> str:
     if isinstance(error, socket.gaierror | UnicodeError):
         why = error.strerror if isinstance(error, OSError) else "no name of a computer"
         return f"{why}; choose an address of this machine with --host"
-    if not isinstance(error, OSError) or error.errno is None:
+    if not isinstance(error, OSError):
         return f"{error}; choose another port"
-    if error.errno == errno.EADDRNOTAVAIL:
+    # Python 3.13 leaves the number out.
+    if error.errno is None or error.errno == errno.EADDRNOTAVAIL:
         return "no address of this machine; choose one with --host"
     return f"{os.strerror(error.errno)}; choose another port"
 

@@ -3,7 +3,9 @@
 import asyncio
 import base64
 import resource
+import sys
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 from websockets.exceptions import ConnectionClosed
@@ -14,6 +16,7 @@ from skin_host.mqtt.publisher import Publisher
 from skin_host.viewer.picture import Cursor, Picture
 from skin_host.viewer.server import MAX_CONNECTIONS, MAX_PIECES, Viewer
 from tests.support.broker import Mosquitto
+from tests.support.waiting import until
 from tests.viewer import test_picture as pictures
 from tests.viewer.test_server import fetch, heard, node, nowhere, of_type, page, pressed, skin
 
@@ -120,6 +123,45 @@ async def test_more_connections_than_files_may_be_open_are_survived_in_silence(
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     assert not [one for one in caplog.records if one.name in ("asyncio", "websockets.server")]
+
+
+def n_files(pid: int) -> int:
+    """How many files a program has open."""
+    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+
+async def test_a_program_that_may_open_no_more_files_writes_one_line_and_serves_later(
+    tmp_path: Path,
+) -> None:
+    """asyncio's own server writes a hundred tracebacks at once, and more each second."""
+    log = tmp_path / "log"
+    command = [sys.executable, "-m", "skin_host", "view", "--robot", "demo", "--port", "0"]
+    with log.open("wb") as stderr:
+        view = await asyncio.create_subprocess_exec(
+            *command, "--broker", nowhere(), stdout=asyncio.subprocess.PIPE, stderr=stderr
+        )
+    try:
+        assert view.stdout is not None
+        url = (await view.stdout.readline()).decode().removeprefix("the page: ").strip()
+        assert (await fetch(url))[0] == 200
+        before = resource.prlimit(view.pid, resource.RLIMIT_NOFILE)
+        # The lowest number that is free is the first that may not be used.
+        lowest = n_files(view.pid)
+        resource.prlimit(view.pid, resource.RLIMIT_NOFILE, (lowest, before[1]))
+        crowd = [await asyncio.open_connection(*place(url)) for _ in range(50)]
+        await until(lambda: "Too many open files" in log.read_text())
+        resource.prlimit(view.pid, resource.RLIMIT_NOFILE, before)
+        assert (await fetch(url))[0] == 200
+        for _, writer in crowd:
+            writer.close()
+    finally:
+        view.terminate()
+        await view.communicate()
+    lines = log.read_text().splitlines()
+    (refused,) = [line for line in lines if "no connection" in line]
+    assert refused.startswith(f"WARNING the page on 127.0.0.1:{place(url)[1]}: ")
+    assert refused.endswith("; trying again")
+    assert len(lines) <= 3  # the broker is not there
 
 
 @pytest.mark.parametrize("name", ["Host", "Origin"])

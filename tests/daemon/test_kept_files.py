@@ -384,15 +384,10 @@ async def test_what_is_pressed_is_in_doubt_only_if_the_daemon_ends_then(
     assert set(load_kept(file, Zeros).unknown["left_hand"]) >= set(touched)
 
 
-@stepped
 async def test_of_two_writes_of_the_zeros_the_newer_one_stays_however_long_the_first_one_takes(
-    clock: SteppedClock,
-    can_bus_settings: Bus,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    can_bus_settings: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk that stalls had the first one take the name after the daemon had ended."""
-    file = tmp_path / "demo-main.zeros.json"
     stalls, goes_on = threading.Event(), threading.Event()
 
     def stall(path: Path, document: object) -> None:
@@ -401,23 +396,19 @@ async def test_of_two_writes_of_the_zeros_the_newer_one_stays_however_long_the_f
             goes_on.wait(PATIENCE_S)
         write_document(path, document)
 
-    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+    async with living(can_bus_settings, tmp_path) as live:
         daemon = live.daemon
-        monkeypatch.setattr("skin_host.daemon.daemon.write_document", stall)
-        older, newer = (Zeros(calibration="x", unknown={"left_hand": [taxel]}) for taxel in (1, 2))
-        writing = []
-        for zeros in (older, newer):
-            daemon._zeros = zeros
-            writing.append(threading.Thread(target=daemon._write_zeros, args=[zeros]))
-            writing[-1].start()
-            assert stalls.wait(PATIENCE_S)
+        monkeypatch.setattr("skin_host.daemon.keeper.write_document", stall)
+        await daemon.configure()  # gives all boards other zeros
+        await until(stalls.is_set)
+        ending = asyncio.create_task(daemon.keeper.end())
+        await asyncio.sleep(0.1)
+        assert not ending.done()
+        assert not (tmp_path / "demo-main.zeros.json").exists()
+        daemon.engine.zeros.doubt(np.arange(daemon.layout.n_taxels) == 1)
         goes_on.set()
-        for one in writing:
-            one.join(PATIENCE_S)
-        assert load_kept(file, Zeros) == newer
-        # One that begins only now is not written any more.
-        daemon._write_zeros(older)
-        assert load_kept(file, Zeros) == newer
+        await ending
+        assert load_kept(tmp_path / "demo-main.zeros.json", Zeros).unknown == {"left_hand": [1]}
 
 
 @pytest.mark.parametrize("configuration", ["other", "same", "damaged"])

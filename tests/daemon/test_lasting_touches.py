@@ -144,7 +144,7 @@ class Lives:
         async def nothing(*_: Any, **__: Any) -> None:
             pass
 
-        self.daemon._keep_zeros = nothing  # type: ignore[method-assign]
+        self.daemon.keeper.end = nothing  # type: ignore[method-assign]
         self.daemon.link.stop = nothing  # type: ignore[method-assign]
         self._host.cancel()
         await asyncio.gather(self._host, return_exceptions=True)
@@ -187,7 +187,7 @@ async def test_a_touch_that_lasts_is_in_a_file_until_it_is_over(
         written.append(path.name)
         write_document(path, document)
 
-    monkeypatch.setattr("skin_host.daemon.daemon.write_document", write)
+    monkeypatch.setattr("skin_host.daemon.keeper.write_document", write)
     async with lives(clock, tmp_path, until_s=20.0) as live:
         await live.until(6.9)
         assert written == []

@@ -22,7 +22,8 @@ from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Settings, changed, load, skin_hash
 from skin_host.daemon.calibrate import calibration_path
 from skin_host.daemon.daemon import Daemon
-from skin_host.daemon.memory import NodeMemory, hand_over, known_of, remembered
+from skin_host.daemon.joining import NodeMemory
+from skin_host.daemon.memory import hand_over, known_of, remembered
 from skin_host.daemon.state import NodeState, Thresholds, Zeros, kept_path, load_kept
 from skin_host.daemon.workers import share_name, share_of
 from skin_host.errors import OtherRobotError, OtherSkinError
@@ -717,8 +718,8 @@ async def test_a_running_node_takes_no_calibration_over_that_of_another_robot(
             await live.daemon.calibrate(0.1)
         assert path.read_text() == content
         for what, kind in (("state", NodeState), ("zeros", Zeros)):
-            await live.daemon.control.keep()
-            await live.daemon._keep_zeros(touched=True)
+            await live.daemon.control.handle("disable", b'{"part":"left_hand"}')
+            await live.daemon.keeper.end()
             assert load_kept(kept_path(live.daemon.settings, "main", what), kind).robot == "demo"
 
 

@@ -8,6 +8,7 @@ import socket
 
 import pytest
 
+from skin_host import acceptor
 from skin_host.daemon import metrics
 from skin_host.daemon.metrics import _response
 from tests.support.broker import free_port
@@ -59,7 +60,7 @@ async def test_a_scraper_that_comes_while_no_more_files_may_be_open_costs_one_li
     """asyncio's own server tries as often as its queue is long, each second, and writes a traceback
     for each of these, ever more.
     """
-    monkeypatch.setattr(metrics, "RETRY_S", 0.05)
+    monkeypatch.setattr(acceptor, "RETRY_S", 0.05)
     port = free_port()
     serving = asyncio.create_task(metrics.serve(port, dict))
     scrapers = [socket.socket() for _ in range(3)]
@@ -89,7 +90,7 @@ async def test_a_scraper_that_comes_while_no_more_files_may_be_open_costs_one_li
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
     assert len(caplog.records) == 1
-    assert "no metrics" in caplog.text and "Too many open files" in caplog.text
+    assert "metrics on 127" in caplog.text and "Too many open files" in caplog.text
     assert (await scrape(scrapers[2])).startswith(b"HTTP/1.0 200")
     serving.cancel()
     await asyncio.gather(serving, return_exceptions=True)

@@ -148,7 +148,7 @@ class Commands:
             enable=engine.disabled.discard,
             thresholds=load_kept(folder() / "none", NodeState).thresholds,
             set_thresholds=lambda new: setattr(daemon, "thresholds", new),
-            keep=lambda _: None,
+            keeper=SimpleNamespace(keep_state=nothing),
             status=dict,
             publisher=SimpleNamespace(show_raw=lambda _: None),
         )

@@ -48,7 +48,7 @@ from skin_host.evaluation.simulate.world import Life, Triangle, World
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import PadKind
 from skin_host.processing.events import Touch
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.frame import PressureFrame
 
 
 class Promises:
@@ -162,8 +162,7 @@ class Promises:
             daemon: it.
             touched: it was asked to end, so what is touched then is in doubt, too.
         """
-        keeping = daemon._keeping
-        if "zeros" in daemon.unkept or (keeping is not None and not keeping.done()):
+        if not daemon.keeper.zeros_are_kept:
             self.excuses.exempt |= daemon.engine.zeros.at_risk(touched)
 
     def over(self, life: Life) -> None:
