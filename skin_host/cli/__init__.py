@@ -172,6 +172,16 @@ def build_parser() -> _Parser:
     return parser
 
 
+def _delivered(config: Path | None) -> str:
+    """Return where the project's own configuration of a name is, if there is none at `config`."""
+    with contextlib.suppress(SkinError, OSError):
+        if config is not None and not config.exists():
+            from skin_host.demo import configuration
+
+            return f"; the delivered {config.name} is {configuration(config.name)}"
+    return ""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     # numpy, imported later, would otherwise start threads that spin: on a busy machine they make a
@@ -183,19 +193,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     emulator_path.provide()
     parser = build_parser()
     completion.complete_if_asked(parser)
-    name = "skin"
+    name, config = "skin", None
     try:
         try:
             arguments = parser.read(sys.argv[1:] if argv is None else list(argv))
         finally:
             sys.stdout.flush()  # help
         name = f"skin {arguments.command}"
+        config = getattr(arguments, "config", None)
         options.check(parser.command(arguments.command), arguments)
         with ended_in_good_order():
             status: int = arguments.run(arguments)
         sys.stdout.flush()
     except SkinError as error:
-        _complain(f"{name}: {error}")
+        _complain(f"{name}: {error}{_delivered(config)}")
         return error.exit_status
     except OSError as error:
         read_enough = isinstance(error, BrokenPipeError) and _reader_left()  # such as `| head`

@@ -2,7 +2,9 @@
 
 import argparse
 import contextlib
+import shutil
 import sys
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +38,7 @@ LIVE_S = 5.0
 #: Until then it is not known whether a robot lives of which the broker has stored something.
 SETTLED_S = 2.5
 PAGE_PORT = 8080
+_INDENT = " " * 4
 
 
 def add_commands(commands: Commands) -> None:
@@ -221,7 +224,8 @@ def _absent(part: str, state: str, why: str, last: dict[str, Any]) -> dict[str, 
 
 
 def status_table(records: dict[str, dict[str, Any]]) -> str:
-    """Health records by part as text for a terminal."""
+    """Health records by part as text; on a terminal its sentences are folded between words."""
+    columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
     lines = [f"{'part':<16} {'state':<14} {'Hz':>6} {'valid':>11} {'age':>9}"]
     for part, record in sorted(records.items()):
         valid = f"{record.get('valid_taxels', 0)}/{record.get('taxels', 0)}"
@@ -232,8 +236,23 @@ def status_table(records: dict[str, dict[str, Any]]) -> str:
         rate = record.get("rate_hz", 0.0)
         state = visible(record.get("state", "?"))
         lines.append(f"{visible(part):<16} {state:<14} {rate:>6.1f} {valid:>11} {age:>9}")
-        lines += [f"    {visible(sentence)}" for sentence in record.get("sentences", ())]
+        for sentence in record.get("sentences", ()):
+            lines += _folded(visible(sentence), columns)
     return "\n".join(lines)
+
+
+def _folded(sentence: str, columns: int) -> list[str]:
+    """Return an indented sentence as lines of so many columns; 0: as one line."""
+    if not columns:
+        return [_INDENT + sentence]
+    return textwrap.wrap(
+        sentence,
+        columns,
+        initial_indent=_INDENT,
+        subsequent_indent=_INDENT,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def _status(arguments: argparse.Namespace) -> int:

@@ -161,7 +161,8 @@ def _add_measurements(commands: Commands) -> None:
         "--recordings",
         type=Path,
         metavar="DIR",
-        help="folder of recordings of real skin (.npz); ../shared/data/insole if it is there",
+        help="folder of recordings of real skin, the insole of Belli et al. 2023 under known "
+        "pressure, as .npz with t_s, counts and pressure_kpa; none comes with skin-host",
     )
     report.add_argument(
         "--quick",

@@ -9,6 +9,7 @@ from itertools import chain
 
 from skin_host.client.heard import Described
 from skin_host.client.presence import Presence
+from skin_host.config.sizes import too_large
 from skin_host.mqtt.info import NodeInfo, PartInfo, decode_info, join_pieces
 from skin_host.mqtt.order import Stamp
 from skin_host.mqtt.payload import MessageError
@@ -17,10 +18,6 @@ from skin_host.mqtt.payload import MessageError
 MAX_NAMES = 256
 #: Of the infos of all its nodes; an iCub's has 0.4 MB.
 MAX_INFO_BYTES = 32 * 1024 * 1024
-#: No part is wider, and no pad: beside one, other parts on a map would be too small to be seen.
-MAX_WIDE_M = 10.0
-#: As far from its origin as a configuration may place one.
-MAX_PLACE_M = 1000.0
 
 
 @dataclass
@@ -178,17 +175,7 @@ def _check_size(name: str, part: PartInfo) -> None:
         MessageError: it is too wide, too far from its origin, or one of its pads is too large.
     """
     places = chain(part.position_m, *(triangle.outline_m for triangle in part.triangles))
-    far_m = wide_m = 0.0
-    for along_m in zip(*places, strict=True):
-        least_m, most_m = min(along_m), max(along_m)
-        far_m = max(far_m, most_m, -least_m)
-        wide_m = max(wide_m, most_m - least_m)
-    for size_m, limit_m, what in (
-        (far_m, MAX_PLACE_M, "from its origin"),
-        (wide_m, MAX_WIDE_M, "wide"),
-        (max(part.radius_mm, default=0.0) * 1e-3, MAX_WIDE_M, "is the radius of a pad"),
-    ):
-        if size_m > limit_m:
-            raise MessageError(
-                f"info: parts.{name}: {size_m:g} m {what}; wanted at most {limit_m:g} m"
-            )
+    axes = list(zip(*places, strict=True))
+    why = too_large(map(min, axes), map(max, axes), max(part.radius_mm, default=0.0))
+    if why:
+        raise MessageError(f"info: parts.{name}: {why}")

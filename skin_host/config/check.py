@@ -13,16 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.compensation import THERMAL_TAXEL, thermal_gains
-from skin_host.config.settings import Settings, format_triangles, parse_triangles, skin_hash
+from skin_host.config.settings import (
+    KindSettings,
+    Settings,
+    format_triangles,
+    parse_triangles,
+    skin_hash,
+)
 from skin_host.errors import nearest, visible
 from skin_host.layout import (
     TAXELS_PER_TRIANGLE,
     BoardLayout,
     Layout,
     PadKind,
+    PartLayout,
     TriangleLayout,
     builtin_kinds,
 )
+from skin_host.layout.geometry import Floats, by_unit, distances_mm, unlike_pitch
 
 #: Bits of a standard frame of eight bytes with its interframe space: without stuff bits, and with
 #: the most possible.
@@ -34,15 +42,8 @@ WRENCH_BITS = (2 * 95, 2 * 115)
 WARN_LOAD = 0.8
 #: Twelve stages at decimation 256 take the chip this long (AD7147; MTB3's timer constants).
 CONVERSION_MS = 36.86
-#: Pads of a unit whose distance is more times the pitch of their kind, or less than this share of
-#: it, are in another unit of length.
-UNLIKE_PITCHES = 3.0
-#: What positions seem to be, by the factor that they are too large.
-_LENGTHS = {1000.0: "mm", 100.0: "cm", 0.001: "metres divided by 1000"}
 #: Pads at this multiple of the least distance face the same way, even on a fingertip.
 NEXT_PITCHES = 1.2
-#: Taxels of a part that are closer than this are at the same place.
-SAME_PLACE_M = 1e-4
 #: Boards of a part whose periods differ by this factor are better in two parts.
 UNLIKE_PERIODS = 2
 #: Foam outside this range usually means a wrong unit.
@@ -51,8 +52,6 @@ USUAL_FOAM_MM = (0.3, 30.0)
 _OF_BOARDS = ("bus", "address", "model", "skin_type", "period_ms")
 _OF_FINGERTIPS = ("node", "bus", "address", "period_ms", "shape", "array")
 
-
-Floats = NDArray[np.float64]
 #: As `skin check --json` prints them.
 Record = dict[str, Any]
 
@@ -88,8 +87,8 @@ def describe(settings: Settings, layout: Layout) -> Record:
             *_bus_warnings(buses, {tip.bus for tip in settings.fingertips.values()}),
             *_interface_warnings(buses),
             *_board_warnings(layout),
-            *_part_warnings(layout),
             *_position_warnings(settings, layout),
+            *_part_warnings(layout),
         ],
     }
 
@@ -251,14 +250,28 @@ def _part_warnings(layout: Layout) -> list[str]:
             warnings.append(
                 f"parts.{part.name}: {alone} taxel(s) have no neighbour; look at their places"
             )
-        cells = np.round(layout.position_m[taxels][pressure] / SAME_PLACE_M).astype(np.int64)
-        shared = len(cells) - len(set(map(tuple, cells.tolist())))
-        if shared:
+        overlapping = int(_overlap(layout, part).sum())
+        if overlapping:
             warnings.append(
-                f"parts.{part.name}: {shared} taxel(s) lie where another one lies; "
-                "contacts there cannot be distinguished"
+                f"parts.{part.name}: {overlapping} taxel(s) lie nearer to another one than the "
+                "radius of their pads; contacts there cannot be distinguished: wanted places in "
+                "mm, files of positions in m"
             )
     return warnings
+
+
+def _overlap(layout: Layout, part: PartLayout) -> NDArray[np.bool_]:
+    """Which taxels of a part measure pressure and lie on another one that does."""
+    first, last = layout.neighbour_start[[part.start, part.stop]]
+    n_neighbours = np.diff(layout.neighbour_start[part.start : part.stop + 1])
+    one = np.repeat(np.arange(part.start, part.stop), n_neighbours)
+    other = layout.neighbour[first:last]
+    apart_mm = 1e3 * np.linalg.norm(layout.position_m[one] - layout.position_m[other], axis=1)
+    press = layout.pad_kind == PadKind.PRESSURE
+    near = press[one] & press[other] & (apart_mm < layout.radius_mm[one])
+    found = np.zeros(part.n_taxels, np.bool_)
+    found[one[near] - part.start] = True
+    return found
 
 
 def _position_warnings(settings: Settings, layout: Layout) -> list[str]:
@@ -273,19 +286,11 @@ def _position_warnings(settings: Settings, layout: Layout) -> list[str]:
             if patch.positions is None:
                 continue
             where = f"parts.{name}.patches[{number}].positions"
-            n_pads = len(kinds[patch.kind].pads_mm)
-            units = [_unit(layout, first, n_pads) for first in range(start, taxel, n_pads)]
-            units = [(apart, normal) for apart, normal in units if len(apart) > 1]
-            if not units:
-                continue
-            apart_mm = float(np.median(np.concatenate([apart.min(axis=1) for apart, _ in units])))
-            pitch_mm = kinds[patch.kind].pitch_mm
-            if not 1.0 / UNLIKE_PITCHES <= apart_mm / pitch_mm <= UNLIKE_PITCHES:
-                warnings.append(
-                    f"{where}: pads lie {apart_mm:.3g} mm apart, those of {patch.kind} "
-                    f"{pitch_mm:g} mm; wanted metres{_looks_like(apart_mm / pitch_mm)}"
-                )
-            facing = sum(map(_n_facing_away, units))
+            taxels, kind = slice(start, taxel), kinds[patch.kind]
+            why = unlike_pitch(patch.kind, kind, layout.position_m[taxels])
+            if why:
+                warnings.append(f"{where}: {why}")
+            facing = _n_facing_away(kind, layout.position_m[taxels], layout.normal[taxels])
             if facing:
                 warnings.append(
                     f"{where}: {facing} pad(s) face the other way than a pad next to them, and "
@@ -294,31 +299,11 @@ def _position_warnings(settings: Settings, layout: Layout) -> list[str]:
     return warnings
 
 
-def _unit(layout: Layout, first: int, n_pads: int) -> tuple[Floats, Floats]:
-    """Return of the k pressure pads of a unit the distances, mm [k, k], and normals [k, 3].
-
-    A pad is infinitely far from itself.
-    """
-    pads = first + np.flatnonzero(layout.pad_kind[first : first + n_pads] == PadKind.PRESSURE)
-    position_mm = 1e3 * layout.position_m[pads]
-    apart_mm = np.linalg.norm(position_mm[:, None] - position_mm[None], axis=2)
-    np.fill_diagonal(apart_mm, np.inf)
-    return apart_mm, layout.normal[pads]
-
-
-def _n_facing_away(unit: tuple[Floats, Floats]) -> int:
-    """Count the pads of a unit that have one next to them whose normal is opposed."""
-    apart_mm, normal = unit
-    near = apart_mm <= NEXT_PITCHES * apart_mm.min(axis=1, keepdims=True)
-    return int((near & (normal @ normal.T < 0.0)).any(axis=1).sum())
-
-
-def _looks_like(ratio: float) -> str:
-    """Return what positions seem to be in whose pads are so many times too far apart."""
-    for factor, name in _LENGTHS.items():
-        if 0.5 < ratio / factor < 2.0:
-            return f": these look like {name}"
-    return ""
+def _n_facing_away(kind: KindSettings, position_m: Floats, normal: Floats) -> int:
+    """Count the pads of units that have one next to them whose normal is opposed."""
+    apart_mm, normals = distances_mm(kind, position_m), by_unit(kind, normal)
+    near = apart_mm <= NEXT_PITCHES * apart_mm.min(axis=2, keepdims=True, initial=np.inf)
+    return int((near & (normals @ normals.swapaxes(1, 2) < 0.0)).any(axis=2).sum())
 
 
 #: Tables for people: what their rows are, and the keys of a record that are shown.

@@ -26,6 +26,7 @@ from skin_host.config.settings import (
     load,
     parse_triangles,
 )
+from skin_host.config.sizes import DECIMALS_M, too_large
 from skin_host.errors import ConfigurationError
 from skin_host.layout.geometry import (
     NEIGHBOUR_PITCHES,
@@ -35,6 +36,7 @@ from skin_host.layout.geometry import (
     read_positions,
     shares_mm2,
     tile,
+    unlike_pitch,
 )
 from skin_host.processing.pressure import BENDS, SLOPES_KPA, PressureCurve
 
@@ -190,8 +192,8 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
 
     Raises:
         ConfigurationError: an unknown kind, wrong numbers of places, a bad positions file,
-            taxels that would feel nothing or lie on one another by the thousand, or probes too
-            large for the pads.
+            taxels that would feel nothing or lie on one another by the thousand, a part larger
+            than any robot's, or probes too large for the pads.
     """
     kinds = builtin_kinds() | settings.kinds
     board_names = list(settings.boards)
@@ -248,6 +250,7 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
                     )
                 )
             taxel += TAXELS_PER_TRIANGLE * len(numbers)
+        _check_size(part_name, part, kinds, columns[first_column:])
         _check_probes(part_name, part, columns[first_column:])
         if all((column.pad_kind != PadKind.PRESSURE).all() for column in columns[first_column:]):
             raise ConfigurationError(
@@ -295,6 +298,32 @@ class _Columns:
 
 
 _ARRAYS = [one.name for one in fields(_Columns) if one.name != "outlines_m"]
+
+
+def _check_size(
+    name: str, part: Part, kinds: dict[str, KindSettings], columns: list[_Columns]
+) -> None:
+    """Refuse a part that is larger than any robot's, with what makes it so large."""
+    places_m = np.concatenate(
+        [np.concatenate([one.position_m, *one.outlines_m]) for one in columns]
+    )
+    # As clients receive it.
+    least_m, most_m = (
+        end_m.round(DECIMALS_M).tolist() for end_m in (places_m.min(axis=0), places_m.max(axis=0))
+    )
+    large = too_large(least_m, most_m, max(float(one.radius_mm.max()) for one in columns))
+    if not large:
+        return
+    for number, (patch, column) in enumerate(zip(part.patches, columns, strict=True)):
+        if patch.positions is not None:
+            why = unlike_pitch(patch.kind, kinds[patch.kind], column.position_m)
+            if why:
+                raise ConfigurationError(f"parts.{name}.patches[{number}].positions: {why}")
+    tiled = sum(patch.positions is None and not patch.places for patch in part.patches)
+    how = "places in mm, files of positions in m"
+    if tiled > 1:
+        how = f"{tiled} of its patches are tiled above each other; place them, or divide the part"
+    raise ConfigurationError(f"parts.{name}: {large}: {how}")
 
 
 def _check_probes(name: str, part: Part, columns: list[_Columns]) -> None:

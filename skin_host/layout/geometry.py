@@ -20,6 +20,11 @@ NEIGHBOUR_PITCHES = 1.6
 TILED_IN_A_ROW = 8
 #: Larger numbers in a table of positions are refused: their squares may not be finite.
 LARGEST_NUMBER = 1e6
+#: Pads of a unit whose distance is more times the pitch of their kind, or less than this share of
+#: it, are in another unit of length.
+UNLIKE_PITCHES = 3.0
+#: What positions seem to be, by the factor that they are too large.
+_LENGTHS = {1000.0: "mm", 100.0: "cm", 0.001: "metres divided by 1000"}
 
 Floats = NDArray[np.float64]
 
@@ -230,3 +235,37 @@ def read_positions(where: str, path: Path, n: int) -> tuple[Floats, Floats]:
     normal = table[:, 3:]
     normal[~normal.any(axis=1)] = [0.0, 0.0, 1.0]
     return table[:, :3], unit_vectors(normal)
+
+
+def by_unit(kind: KindSettings, vectors: Floats) -> Floats:
+    """Return of vectors [n, 3] of units' pads those of each one's pressure pads, [units, k, 3]."""
+    pressing = [pad for pad in range(len(kind.pads_mm)) if pad not in kind.thermal]
+    return vectors.reshape(-1, len(kind.pads_mm), 3)[:, pressing]
+
+
+def distances_mm(kind: KindSettings, position_m: Floats) -> Floats:
+    """Return the distances of the pressure pads of each unit, [units, k, k].
+
+    A pad is infinitely far from itself.
+    """
+    position_mm = 1e3 * by_unit(kind, position_m)
+    apart_mm: Floats = np.linalg.norm(position_mm[:, :, None] - position_mm[:, None], axis=3)
+    pads = np.arange(apart_mm.shape[1])
+    apart_mm[:, pads, pads] = np.inf
+    return apart_mm
+
+
+def unlike_pitch(name: str, kind: KindSettings, position_m: Floats) -> str:
+    """Return what shows that positions of units of the kind `name` are not in metres, or ""."""
+    nearest_mm = distances_mm(kind, position_m).min(axis=2, initial=np.inf)
+    if nearest_mm.shape[1] < 2:
+        return ""
+    apart_mm = float(np.median(nearest_mm))
+    pitches = apart_mm / kind.pitch_mm
+    if 1.0 / UNLIKE_PITCHES <= pitches <= UNLIKE_PITCHES:
+        return ""
+    alike = [length for factor, length in _LENGTHS.items() if 0.5 < pitches / factor < 2.0]
+    return (
+        f"pads lie {apart_mm:.3g} mm apart, those of {name} {kind.pitch_mm:g} mm; wanted metres"
+        + "".join(f": these look like {length}" for length in alike)
+    )

@@ -19,6 +19,7 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from skin_host.config.fields import Name
+from skin_host.config.sizes import DECIMALS_M
 from skin_host.mqtt.messages import SCALE_KPA
 from skin_host.mqtt.payload import MessageError, decode
 from skin_host.mqtt.topics import Topics
@@ -49,8 +50,8 @@ STATE: Final = "{{ 'None' if value == 'UNKNOWN' else value }}"
 #: 100 000 taxels and their triangles fit.
 MAX_BYTES = 32 * 1024 * 1024
 MAX_PIECES = 10_000
-#: Positions to 0.001 mm, areas and radii to 0.01, normals to 0.0001.
-_M, _MM, _NORMAL = 6, 2, 4
+#: Areas and radii are published to 0.01, normals to 0.0001.
+_MM, _NORMAL = 2, 4
 
 
 class CalibrationInfo(Struct, frozen=True):
@@ -262,7 +263,7 @@ def _part_info(layout: "Layout", number: int, part: "PartLayout", *, frames: boo
     return PartInfo(
         period_ms=max(layout.boards[board].settings.period_ms for board in part.boards),
         pads=["thermal" if thermal else "pressure" for thermal in is_thermal.tolist()],
-        position_m=_vectors(layout.position_m[mine], _M),
+        position_m=_vectors(layout.position_m[mine], DECIMALS_M),
         normal=_vectors(layout.normal[mine], _NORMAL),
         radius_mm=_rounded(layout.radius_mm[mine], _MM),
         area_mm2=_rounded(layout.area_mm2[mine], _MM),
@@ -272,7 +273,7 @@ def _part_info(layout: "Layout", number: int, part: "PartLayout", *, frames: boo
                 triangle.number,
                 triangle.kind,
                 triangle.first - part.start,
-                _vectors(triangle.outline_m, _M),
+                _vectors(triangle.outline_m, DECIMALS_M),
                 layout.boards[triangle.board].settings.no_load,
             )
             for triangle in layout.triangles

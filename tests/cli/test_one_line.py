@@ -90,3 +90,22 @@ def test_an_import_that_fails_names_its_reason_alone(
     assert line.startswith("skin import: ")
     assert why in line
     assert not output.exists()
+
+
+@pytest.mark.parametrize("command", ["check", "demo", "run", "emulate"])
+def test_who_names_a_delivered_configuration_where_it_is_not_learns_where_it_is(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A package has them beside its environment's other data, not in the working directory."""
+    missing = tmp_path / "icub.toml"
+    assert main([command, str(missing)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    where = Path(__file__).parents[2] / "config" / "icub.toml"
+    assert line == (
+        f"skin {command}: {missing}: cannot be read: No such file or directory; the delivered "
+        f"icub.toml is {where}"
+    )
+    for other in ("other.toml", "n" * 300):
+        assert main([command, str(tmp_path / other)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "; the delivered" not in line

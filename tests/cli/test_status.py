@@ -1,7 +1,13 @@
 """`skin status` and `skin listen` where the broker has what a robot published that is gone now."""
 
 import asyncio
+import fcntl
 import json
+import os
+import struct
+import subprocess
+import sys
+import termios
 from pathlib import Path
 from typing import Any
 
@@ -100,3 +106,48 @@ async def test_who_listens_to_a_robot_that_is_switched_off_learns_it(
     async with aiomqtt.Client(mosquitto.host, mosquitto.port) as stranger:
         await stranger.publish(topic, json.dumps(event).encode(), qos=1)
     assert await listening == 0
+
+
+#: A sentence that no terminal of 60 columns shows in one line.
+LONG = (
+    "triangle 3 of board hand_2 is missing: look at its flat cable, then calibrate the part again"
+)
+
+
+async def test_sentences_are_folded_between_words_on_a_terminal_and_not_in_a_pipe(
+    mosquitto: Mosquitto,
+) -> None:
+    """A terminal breaks a longer line within a word, at the left edge; grep reads lines."""
+    await left(mosquitto)
+    health = {"schema": "skin.health/1"} | WELL | {"state": "degraded", "sentences": [LONG]}
+    command = [sys.executable, "-m", "skin_host", "status"]
+    command += ["--broker", f"mqtt://{mosquitto.host}:{mosquitto.port}"]
+    variables = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
+
+    def shown(columns: int | None) -> list[str]:
+        if columns is None:
+            done = subprocess.run(command, env=variables, stdout=subprocess.PIPE, check=False)
+            return done.stdout.decode().splitlines()
+        screen, terminal = os.openpty()
+        fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+        subprocess.run(command, env=variables, stdout=terminal, check=False)
+        os.close(terminal)
+        text = os.read(screen, 100_000).decode()
+        os.close(screen)
+        return text.splitlines()
+
+    async def publish() -> None:
+        async with aiomqtt.Client(mosquitto.host, mosquitto.port) as robot:
+            while True:
+                for part in INFO.parts:
+                    await robot.publish(f"skin/demo/{part}/health", json.dumps(health))
+                await asyncio.sleep(0.1)
+
+    publishing = asyncio.create_task(publish())
+    narrow, wide, piped = [await asyncio.to_thread(shown, columns) for columns in (60, 200, None)]
+    publishing.cancel()
+    assert narrow[2:4] == [
+        "    triangle 3 of board hand_2 is missing: look at its flat",
+        "    cable, then calibrate the part again",
+    ]
+    assert wide[2] == piped[2] == f"    {LONG}"

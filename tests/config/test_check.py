@@ -125,8 +125,20 @@ def test_taxels_at_one_place_and_taxels_alone_are_warned_of(tmp_path: Path) -> N
     )
     assert [warning.split(";")[0] for warning in description["warnings"]] == [
         "parts.arm: 10 taxel(s) have no neighbour",
-        "parts.arm: 1 taxel(s) lie where another one lies",
+        "parts.arm: 2 taxel(s) lie nearer to another one than the radius of their pads",
     ]
+
+
+def test_places_in_metres_are_warned_of() -> None:
+    """0.03 m are 30 mm; as 0.03 mm the second triangle lies on the first."""
+    patch = {"board": "mtb", "triangles": "0-1", "places": [{"x_mm": 0.0}, {"x_mm": 0.03}]}
+    for kind, taxels in (("triangle", 24), ("triangle_10pad", 20)):
+        (warning,) = described(
+            {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}},
+            {"arm": {"patches": [patch | {"kind": kind}]}},
+        )["warnings"]
+        assert warning.startswith(f"parts.arm: {taxels} taxel(s) lie nearer to another one than ")
+        assert warning.endswith(": wanted places in mm, files of positions in m")
 
 
 def positions_warnings(
@@ -141,13 +153,12 @@ def positions_warnings(
     patch = {"board": "mtb", "triangles": "0-1", "positions": "arm.txt", "kind": kind}
     boards: dict[str, dict[str, object]] = {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}}
     warnings = described(boards, {"arm": {"patches": [patch]}}, folder=tmp_path)["warnings"]
-    return [one for one in warnings if "positions" in one]
+    return [one for one in warnings if ".positions: " in one]
 
 
 @pytest.mark.parametrize(
     ("scale", "meant"),
     [
-        (1000.0, "wanted metres: these look like mm"),
         (100.0, "wanted metres: these look like cm"),
         (0.001, "wanted metres: these look like metres divided by 1000"),
         (20.0, "wanted metres"),

@@ -11,10 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skin_host.client.nodes import Nodes
+from skin_host.client.presence import Presence
 from skin_host.config.settings import KindSettings, PlaceSettings, Settings, changed
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout, PadKind, build_layout, builtin_kinds
 from skin_host.layout.geometry import NEIGHBOUR_PITCHES, fitted_outline, lay, shares_mm2, tile
+from skin_host.mqtt.info import encode_info, node_info
 
 HERE = Path()
 angles_deg = st.floats(-360, 360)
@@ -438,9 +441,11 @@ def test_a_part_without_a_pressure_pad_is_refused_and_a_triangle_without_one_is_
 
 
 def body(boards: int, places: list[dict[str, float]]) -> Settings:
-    """A robot of one part, each of its boards with a triangle at each of these places."""
+    """A robot of one part, each of its boards with a triangle at each of these places, or 16 of
+    them side by side.
+    """
     names = [f"b{number}" for number in range(boards)]
-    patch = {"triangles": f"0-{len(places) - 1}", "places": places}
+    patch = {"triangles": f"0-{len(places or range(16)) - 1}", "places": places}
     return msgspec.convert(
         {
             "robot": "test",
@@ -466,6 +471,53 @@ def test_thousands_of_taxels_at_one_place_are_refused_before_they_fill_the_memor
         assert tracemalloc.get_traced_memory()[1] < 200e6
     finally:
         tracemalloc.stop()
+
+
+def in_mm(tmp_path: Path) -> Settings:
+    """A part whose file of positions is in mm."""
+    rows = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (12, 1))
+    rows[:, :2] = builtin_kinds()["triangle"].pads_mm
+    np.savetxt(tmp_path / "arm.txt", rows)
+    return skin({"triangles": "0", "positions": "arm.txt"})
+
+
+def test_a_file_of_positions_in_mm_is_refused_as_such(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError) as refused:
+        build_layout(in_mm(tmp_path), tmp_path)
+    assert str(refused.value) == (
+        "parts.arm.patches[0].positions: pads lie 5e+03 mm apart, those of triangle 5 mm; wanted "
+        "metres: these look like mm"
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "seen", "cause"),
+    [
+        (body(1, [{}, {"x_mm": 12e3}]), "12.03 m wide", "places in mm, files of positions in m"),
+        (body(1, [{"y_mm": -1e6}]), "1000.0087 m from its origin", "places in mm, files of posi"),
+        (body(200, []), "10.392 m wide", "200 of its patches are tiled above each other; place th"),
+    ],
+    ids=["wide", "far", "tiled"],
+)
+def test_a_part_that_no_robot_has_is_refused(settings: Settings, seen: str, cause: str) -> None:
+    """Clients refuse its description, too: beside it other parts would be too small to be seen."""
+    with pytest.raises(ConfigurationError) as refused:
+        build_layout(settings, HERE)
+    said, _, wanted = str(refused.value).partition("; wanted at most ")
+    assert said == f"parts.arm: {seen}"
+    assert wanted.partition(" m: ")[2].startswith(cause)
+
+
+@given(st.floats(9_969.999, 9_970.001), st.floats(-0.001, 0.001))
+def test_what_is_published_of_a_part_that_may_be_is_taken(apart_mm: float, x_mm: float) -> None:
+    """At the limit, and rounded as it is published."""
+    settings = body(1, [{"x_mm": x_mm}, {"x_mm": x_mm + apart_mm}])
+    try:
+        layout = build_layout(settings, HERE)
+    except ConfigurationError:
+        return
+    info = node_info(layout, "main", version="1", configuration="x")
+    Nodes(Presence(stale_s=3.0)).take_info("main", 1, encode_info(info), None, 0.0)
 
 
 def test_a_few_taxels_at_one_place_are_neighbours() -> None:

@@ -3,7 +3,7 @@ import { calibrated, inTaxels } from "./calibrated.js";
 import { DASHES, paper, ramp, shareOf, theme } from "./colours.js";
 import { SkinMap } from "./map.js";
 import { isLeast, put, showContacts, showHealth, showParts, told } from "./panels.js";
-import { Store } from "./store.js";
+import { isBound, Store } from "./store.js";
 import { HAS_PLOTS, lineColour, nearest, Plot, roundTicks } from "./strip.js";
 
 const $ = (id) => document.getElementById(id);
@@ -389,6 +389,9 @@ function courseOf(key, take) {
   return held.get(key);
 }
 
+/** What the plots show, until they are drawn again. */
+let plotted = { chosen: [], forces: [], endMs: 0, seconds: 60 };
+
 function showPlots(nowMs) {
   const endMs = heldMs ?? nowMs;
   const seconds = Number($("length").value);
@@ -402,20 +405,7 @@ function showPlots(nowMs) {
   strip.show(chosen, endMs, seconds);
   const forces = forceLines(seconds, fromMs, endMs);
   force.show(forces, endMs, seconds);
-  const atMs = agoMs === null ? null : endMs - agoMs;
-  const reachMs = Math.max(700, seconds * 10);
-  const at = (course) => nearest(course, atMs, reachMs);
-  $("at").hidden = atMs === null && heldMs === null && HAS_PLOTS;
-  const words = [heldMs === null ? "" : `held ${((nowMs - heldMs) / 1000).toFixed(0)} s ago`, atMs === null ? "" : `at −${(agoMs / 1000).toFixed(agoMs < 100000 ? 1 : 0)} s`];
-  put($("at"), HAS_PLOTS ? words.filter(Boolean).join(", ") : "There are no plots: this installation lacks uPlot. Install it again where npm or PyPI can be reached.");
-  map.chosen.forEach(({ part, taxel }, i) => {
-    const text = $("chosen").children[i]?.querySelector("span");
-    const of = store.part(part);
-    if (!text || !of) return;
-    const seen = atMs === null ? null : at(chosen[i].course)?.[1] ?? null;
-    const then = seen === null ? "–" : map.raw ? `${signed(-Math.round(seen))} units` : `${seen.toFixed(1)} kPa`;
-    put(text, `${part} ${taxel}: ${atMs === null ? value(of, taxel) : then}`);
-  });
+  plotted = { chosen, forces, endMs, seconds };
   const list = $("forces");
   const key = JSON.stringify([theme(), forces.map(({ name }) => name)]);
   if (list.dataset.shown !== key) {
@@ -426,11 +416,29 @@ function showPlots(nowMs) {
       return item;
     }));
   }
-  forces.forEach(({ name, course }, i) => {
-    const [, seen, isLeastThen] = (atMs === null ? course.at(-1) : at(course)) ?? [];
-    const isTotal = name === "total";
-    const least = isTotal && atMs === null && heldMs === null ? isLeast(shownParts(), nowMs) : isLeastThen;
-    put(list.children[i].lastChild, `${name}: ${isTotal && !Number.isFinite(seen) ? "not known" : told(seen, 2, "N", least)}`);
+}
+
+/** Write the values under the plots: those at the cursor, and the present ones with each picture, as the table of contacts has them. */
+function showValues(nowMs) {
+  const { chosen, forces, endMs, seconds } = plotted;
+  const atMs = agoMs === null ? null : endMs - agoMs;
+  const reachMs = Math.max(700, seconds * 10);
+  const at = (course) => nearest(course, atMs, reachMs);
+  $("at").hidden = atMs === null && heldMs === null && HAS_PLOTS;
+  const words = [heldMs === null ? "" : `held ${((nowMs - heldMs) / 1000).toFixed(0)} s ago`, atMs === null ? "" : `at −${(agoMs / 1000).toFixed(agoMs < 100000 ? 1 : 0)} s`];
+  put($("at"), HAS_PLOTS ? words.filter(Boolean).join(", ") : "There are no plots: this installation lacks uPlot. Install it again where npm or PyPI can be reached.");
+  map.chosen.forEach(({ part, taxel }, i) => {
+    const text = $("chosen").children[i]?.querySelector("span");
+    const of = store.part(part);
+    if (!text || !of) return;
+    const seen = atMs === null ? null : at(chosen[i]?.course ?? [])?.[1] ?? null;
+    const then = seen === null ? "–" : map.raw ? `${signed(-Math.round(seen))} units` : `${seen.toFixed(1)} kPa`;
+    put(text, `${part} ${taxel}: ${atMs === null ? value(of, taxel) : then}`);
+  });
+  forces.forEach(({ name, course, present }, i) => {
+    const isNow = atMs === null && heldMs === null;
+    const [, seen, isLeastThen] = (isNow ? [nowMs, ...present(nowMs)] : atMs === null ? course.at(-1) : at(course)) ?? [];
+    put($("forces").children[i].lastChild, `${name}: ${name === "total" && !Number.isFinite(seen) ? "not known" : told(seen, 2, "N", isLeastThen)}`);
   });
 }
 
@@ -453,10 +461,26 @@ function forceLines(seconds, fromMs, endMs) {
       return [t, unknown && sum < 1e-9 ? null : sum, bounds > 0];
     });
   });
-  const lines = [{ name: "total", course: total, colour: look.text, dash: [] }];
+  const lines = [{ name: "total", course: total, present: presentForce, colour: look.text, dash: [] }];
   const one = map.selected && store.part(map.selected.part)?.forceOf.get(map.selected.id);
-  if (one) lines.push({ name: `#${map.selected.id}`, course: courseOf(`force of ${map.selected.part} ${map.selected.id} ${seconds}`, () => one.between(fromMs, endMs)), colour: look.alarm, dash: [6, 3] });
+  if (one) lines.push({ name: `#${map.selected.id}`, present: presentForceOf(map.selected), course: courseOf(`force of ${map.selected.part} ${map.selected.id} ${seconds}`, () => one.between(fromMs, endMs)), colour: look.alarm, dash: [6, 3] });
   return lines;
+}
+
+/** The present force of all contacts of the parts that are shown, null if nothing is known; and whether it is a bound. */
+function presentForce(nowMs) {
+  const known = shownParts().map((part) => part.force(nowMs));
+  const sum = known.reduce((total, force) => total + (force ?? 0), 0);
+  return [sum < 1e-9 && known.includes(null) ? null : sum, isLeast(shownParts(), nowMs)];
+}
+
+/** The same of one contact. */
+function presentForceOf({ part: name, id }) {
+  return (nowMs) => {
+    const part = store.part(name);
+    const contact = part && !part.stale(nowMs) && part.contacts.find((one) => one.id === id);
+    return contact ? [contact.force_n, isBound(contact)] : [null, true];
+  };
 }
 
 /** The parts whose contacts and health are shown: the chosen one, or all. */
@@ -501,6 +525,7 @@ function frame(nowMs) {
       for (const part of store.parts) part.rememberForces(nowMs);
       showPlots(nowMs);
     }
+    showValues(nowMs);
     showRecording();
     $("calibrate").hidden = !store.status.commands;
     $("calibrate").disabled = calibrating !== null || !mayCommand();
@@ -570,6 +595,8 @@ function walk(by) {
   const taxels = parts.flatMap((part) => Array.from({ length: part.n }, (_, taxel) => ({ part: part.name, taxel })));
   const at = map.cursor ? taxels.findIndex((one) => one.part === map.cursor.part && one.taxel === map.cursor.taxel) : -Math.max(by, 0);
   map.cursor = taxels[(at + by + taxels.length) % taxels.length];
+  // Enter chooses it; a button that has the focus would take that.
+  $("map").focus({ preventScroll: true });
   dirty = true;
 }
 

@@ -221,8 +221,7 @@ async def test_a_press_is_seen_and_parts_and_values_can_be_chosen(
 
 
 async def choose_two(seen: Page) -> None:
-    """Choose two taxels of the first part."""
-    await seen.run('document.getElementById("map").focus()')
+    """Choose two taxels of the first part, by keys alone."""
     for _ in range(2):
         await seen.press(".")
         await seen.press("Enter")
@@ -395,6 +394,39 @@ async def test_a_force_that_is_only_a_bound_is_shown_as_one(
         bounds = ["1.50 N", "≥ 9.0 kPa", "20 mm²"]
         why = "a pad is pressed beyond its calibrated range"
         await shows("tip", bounds, why, beyond=True, verdict="contact")
+
+
+#: What the legend of the forces says beside the table, of each picture of some seconds in which
+#: a force changes as fast as touches come.
+SAYS_THE_SAME = """new Promise(done => {
+    const contact = { id: 4, taxels: [0], centroid_m: null, peak_kpa: 9, area_mm2: 20,
+                      partial: false, beyond: false, verdict: null };
+    const seen = [];
+    let [force_n, left] = [1, 200];
+    const frame = () => {
+        const list = document.querySelector("#forces span")?.textContent;
+        seen.push([list, "total: " + document.getElementById("total").textContent]);
+        force_n += 0.01;
+        contacts("palm", "ON", null, [{ ...contact, force_n }]);
+        if (left--) requestAnimationFrame(frame);
+        else done(seen.slice(20));
+    };
+    frame();
+})"""
+
+
+async def test_the_legend_of_the_forces_is_as_new_as_the_table(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """It was up to a tenth of a second older."""
+    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        await seen.run(SERVER)
+        await seen.run("setInterval(() => { pressed(0, 0); pressed(1, 0); health('tip', 0); }, 50)")
+        await seen.run("contacts('palm', 'OFF'); contacts('wrist', 'OFF'); contacts('tip', 'OFF')")
+        pairs = await seen.run(SAYS_THE_SAME)
+        assert len({total for total, _ in pairs}) > 100
+        assert [total for total, _ in pairs] == [total for _, total in pairs]
 
 
 #: The course of a force from the times, values and bounds of what came, between two times.
