@@ -12,13 +12,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emulator.chips.noise import SampledNoise
+from skin_host.bus.wire import TRIANGLES
 from skin_host.config.settings import Settings
-from skin_host.layout import Layout, build_layout
+from skin_host.layout import Layout, build_layout, builtin_kinds
+from skin_host.layout.geometry import tile
 from skin_host.processing.calibration.calibrator import KNOWN_SAMPLES, Calibrator
 from skin_host.processing.frame import PressureFrame
 from skin_host.processing.pipeline import Pipeline
 
 BOARDS_PER_BUS = 14
+#: So many boards lie above each other, in columns this far apart: no part may be wider than 10 m.
+BOARDS_PER_COLUMN, COLUMN_MM = 128, 300.0
 
 
 def wired(boards: int) -> dict[str, dict[str, Any]]:
@@ -33,6 +37,20 @@ def wired(boards: int) -> dict[str, dict[str, Any]]:
     }
 
 
+def _places(kind: str, number: int) -> list[dict[str, float]]:
+    """Where the triangles of a board lie, by its number."""
+    column, row = divmod(number, BOARDS_PER_COLUMN)
+    places, height_mm = tile(builtin_kinds()[kind], TRIANGLES, 0.0)
+    return [
+        {
+            "x_mm": float(place.x_mm + column * COLUMN_MM),
+            "y_mm": float(place.y_mm + row * height_mm),
+            "turn_deg": place.turn_deg,
+        }
+        for place in places
+    ]
+
+
 def flat_skin(
     boards: int, kind: str = "triangle", processing: dict[str, Any] | None = None
 ) -> tuple[Settings, Layout]:
@@ -45,8 +63,14 @@ def flat_skin(
             "skin": {
                 "foam_mm": 2.0,
                 "patches": [
-                    {"board": name, "triangles": "0-15", "kind": kind, "shift": 3}
-                    for name in wiring["boards"]
+                    {
+                        "board": name,
+                        "triangles": "0-15",
+                        "kind": kind,
+                        "shift": 3,
+                        "places": _places(kind, number),
+                    }
+                    for number, name in enumerate(wiring["boards"])
                 ],
             }
         },
