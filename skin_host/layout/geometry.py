@@ -86,7 +86,7 @@ def _rotation_from_z(normal: tuple[float, ...]) -> Floats:
     """Shortest rotation [3, 3] that lays the z axis along `normal` (Rodrigues)."""
     x, y, z = unit_vectors(np.array(normal))
     side = np.hypot(x, y)
-    if side == 0:
+    if side * side == 0:  # so small numbers have no digits that would give the direction
         return np.diag([1.0, np.sign(z), np.sign(z)])
     # With u = (x, y) / side this is exact near -z too, where 1 / (1 + z) is not.
     u, v = x / side, y / side

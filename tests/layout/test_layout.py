@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from skin_host.client.nodes import Nodes
@@ -207,6 +207,7 @@ def test_positions_from_a_file_are_taken_as_they_stand(tmp_path: Path) -> None:
     assert layout.normal == pytest.approx(np.tile([0, 0.6, 0.8], (12, 1)))
 
 
+@example(turn=0.0, normal=(5e-324, 5e-324, -1.0), mirror=False)
 @given(turn=angles_deg, normal=directions, mirror=st.booleans())
 def test_the_outline_is_fitted_to_positions_from_a_file(
     turn: float, normal: tuple[float, float, float], mirror: bool

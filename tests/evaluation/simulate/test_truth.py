@@ -20,7 +20,7 @@ from skin_host.evaluation.simulate.run import simulate
 from skin_host.evaluation.simulate.troubles.catalogue import APART, kinds_of
 from skin_host.fingertip.events import Over, Slip
 from skin_host.fingertip.tip import Tip
-from skin_host.processing import pipeline, touch
+from skin_host.processing import rules, touch
 from skin_host.processing.contacts import ContactTracker
 from skin_host.processing.events import Touch
 from skin_host.processing.frame import PressureFrame
@@ -78,7 +78,7 @@ def of_levels(margin_units: float = 0.0, noise: float = 1.0) -> Callable[[Patch]
             more = found.enter + margin_units, found.leave + margin_units
             return found._replace(enter=more[0], leave=more[1])
 
-        monkeypatch.setattr(pipeline, "levels", off)
+        monkeypatch.setattr(rules, "levels", off)
 
     return plant
 
