@@ -18,13 +18,7 @@ from skin_host.config.settings import Processing
 from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.conversions import CONVERSION_S
-from skin_host.processing.curves import (
-    Curve,
-    Parabolas,
-    Reader,
-    TableCurve,
-    Tables,
-)
+from skin_host.processing.curves import Curve, Parabolas, Reader, TableCurve, Tables
 from skin_host.processing.drift import BaselineTracker
 from skin_host.processing.frame import PressureFrame
 from skin_host.processing.masks import Mask, any_of
@@ -34,7 +28,7 @@ from skin_host.processing.relaxation import Relaxation as Model
 from skin_host.processing.rules import Rules
 from skin_host.processing.touch import Levels
 from skin_host.processing.touch_decision import TouchDecision
-from skin_host.processing.windows import Window, Windows
+from skin_host.processing.windows import Windows, WindowSums
 
 #: A longer step is a gap or a jump of the clock. The foam's model is advanced by it, under the
 #: readings after it; nothing else depends on its length.
@@ -601,7 +595,7 @@ class _PartPipeline:
             self._noted = self._nowhere
         windows.begin_piece()
 
-    def _follow_drift(self, window: Window) -> None:
+    def _follow_drift(self, window: WindowSums) -> None:
         """Move the baselines by the means of a window."""
         elapsed_s = window.elapsed_s
         mean_kpa = np.divide(window.sum_kpa, window.samples, dtype=np.float64)
@@ -635,7 +629,7 @@ class _PartPipeline:
             decision.residuals.fade(elapsed_s)
         self._lacking.fill(0)
 
-    def _conversions(self, window: Window) -> NDArray[np.float64]:
+    def _conversions(self, window: WindowSums) -> NDArray[np.float64]:
         """Return how many independent measurements are in the mean of each taxel [m].
 
         A reading that was not received is the last one again. Where the share p is lost by chance,

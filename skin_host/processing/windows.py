@@ -19,7 +19,7 @@ IDLE_UPDATE_S = 0.2
 Floats = NDArray[np.float32]
 
 
-class Window:
+class WindowSums:
     """Sums over the samples of a time, of m taxels.
 
     Attributes:
@@ -43,7 +43,7 @@ class Window:
         self.skipped = 0
         self.elapsed_s = 0.0
 
-    def add(self, piece: "Window") -> None:
+    def add(self, piece: "WindowSums") -> None:
         """Add what followed."""
         np.add(self.sum_kpa, piece.sum_kpa, out=self.sum_kpa)
         np.fmin(self.lowest_kpa, piece.lowest_kpa, out=self.lowest_kpa)
@@ -75,8 +75,8 @@ class Windows:
 
     def __init__(self, m: int, drift_s: float, on_fold: Callable[[Floats, Floats], None]) -> None:
         self._drift_s, self._on_fold = drift_s, on_fold
-        self.drifting, self.relaxing = Window(m), Window(m)
-        self._piece = Window(m)
+        self.drifting, self.relaxing = WindowSums(m), WindowSums(m)
+        self._piece = WindowSums(m)
         self._rows = np.zeros((ROWS, m), np.float32)
         self._row = list(self._rows)
         self._laid = 0
