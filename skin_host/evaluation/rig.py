@@ -37,17 +37,19 @@ def wired(boards: int) -> dict[str, dict[str, Any]]:
     }
 
 
-def _places(kind: str, number: int) -> list[dict[str, float]]:
-    """Where the triangles of a board lie, by its number."""
-    column, row = divmod(number, BOARDS_PER_COLUMN)
+def _places(kind: str, boards: int) -> list[list[dict[str, float]]]:
+    """Where the triangles of each board lie."""
     places, height_mm = tile(builtin_kinds()[kind], TRIANGLES, 0.0)
     return [
-        {
-            "x_mm": float(place.x_mm + column * COLUMN_MM),
-            "y_mm": float(place.y_mm + row * height_mm),
-            "turn_deg": place.turn_deg,
-        }
-        for place in places
+        [
+            {
+                "x_mm": float(place.x_mm + column * COLUMN_MM),
+                "y_mm": float(place.y_mm + row * height_mm),
+                "turn_deg": place.turn_deg,
+            }
+            for place in places
+        ]
+        for column, row in (divmod(number, BOARDS_PER_COLUMN) for number in range(boards))
     ]
 
 
@@ -68,9 +70,9 @@ def flat_skin(
                         "triangles": "0-15",
                         "kind": kind,
                         "shift": 3,
-                        "places": _places(kind, number),
+                        "places": places,
                     }
-                    for number, name in enumerate(wiring["boards"])
+                    for name, places in zip(wiring["boards"], _places(kind, boards), strict=True)
                 ],
             }
         },

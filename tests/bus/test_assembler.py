@@ -68,6 +68,17 @@ def feed(
     return assembler.feed(batch.of(sent)).sweeps
 
 
+def feed_in_parts(
+    assembler: Assembler, sent: list[tuple[int, bytes, int]], at_once: int
+) -> list[Sweep]:
+    """Feed so many frames at once."""
+    return [
+        sweep
+        for at in range(0, len(sent), at_once)
+        for sweep in feed(assembler, sent[at : at + at_once])
+    ]
+
+
 class PaddedBatch(FrameBatch):
     """Frames of which more lies in memory, as it does where the kernel wrote them."""
 
@@ -155,11 +166,7 @@ def test_a_frame_that_is_late_by_most_of_a_period_joins_no_other_sweep(
                 times[place] += round(late * PERIOD)
         sent += [(*swept[i][:2], t_ns) for i, t_ns in zip(order, times, strict=True)]
     sent.sort(key=lambda frame: frame[2])
-    sweeps = [
-        sweep
-        for at in range(0, len(sent), at_once)
-        for sweep in feed(assembler, sent[at:][:at_once])
-    ]
+    sweeps = feed_in_parts(assembler, sent, at_once)
     sweeps += assembler.flush()
     whole = []
     for sweep in sweeps:
@@ -219,11 +226,7 @@ def test_a_stamp_that_is_ahead_of_its_time_joins_no_two_sweeps(ahead_ms: int, at
             place = number // 4 % 8
             swept[place] = (*swept[place][:2], swept[place][2] + ahead_ms * MS)
         sent += swept
-    sweeps = [
-        sweep
-        for at in range(0, len(sent), at_once)
-        for sweep in feed(assembler, sent[at:][:at_once])
-    ]
+    sweeps = feed_in_parts(assembler, sent, at_once)
     sweeps += assembler.flush()
     raws = [values(4, number) for number in range(1, 42)]
     whole = 0
@@ -253,11 +256,7 @@ def test_a_sweep_whose_first_stamp_is_ahead_ends_in_time_however_it_is_read(
     sent[0] = (*sent[0][:2], sent[0][2] + 60 * MS)
     del sent[lost]
     sent += frames(values(4, 6), 6 * PERIOD)[lost:]
-    sweeps = [
-        sweep
-        for at in range(0, len(sent), at_once)
-        for sweep in feed(assembler, sent[at:][:at_once])
-    ]
+    sweeps = feed_in_parts(assembler, sent, at_once)
     sweeps += assembler.flush()
     for sweep in sweeps:
         number = sweep.t_ns // PERIOD
@@ -647,11 +646,7 @@ def test_a_board_may_send_in_other_classes(
         for frame in in_classes(frames(raw, number * PERIOD), *classes)
     ]
     assembler = make(f"0-{triangles - 1}")
-    sweeps = [
-        sweep
-        for at in range(0, len(sent), at_once)
-        for sweep in feed(assembler, sent[at:][:at_once])
-    ]
+    sweeps = feed_in_parts(assembler, sent, at_once)
     assert [sweep.raw[:triangles].tolist() for sweep in sweeps] == [
         raw.tolist() for raw in raws[first:]
     ]
@@ -698,11 +693,7 @@ def test_frames_in_a_class_in_which_their_board_does_not_send_are_no_halves(
                 refused += 1
         sent += swept
     assembler = make(f"0-{triangles - 1}")
-    sweeps = [
-        sweep
-        for at in range(0, len(sent), at_once)
-        for sweep in feed(assembler, sent[at:][:at_once])
-    ]
+    sweeps = feed_in_parts(assembler, sent, at_once)
     sweeps += assembler.flush()
     for sweep in sweeps:
         raw = raws[sweep.t_ns // PERIOD]

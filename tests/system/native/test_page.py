@@ -348,15 +348,22 @@ async def test_nothing_touches_only_what_is_known_to_be_untouched(
         assert await seen.run(CONTACTS) == []
 
 
-async def test_a_force_that_is_only_a_bound_is_shown_as_one(
-    mosquitto: Mosquitto, tmp_path: Path
-) -> None:
-    """Of skin beside dead pads, or pressed beyond its range; of a fingertip whose board is."""
-    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
+@asynccontextmanager
+async def untouched(mosquitto: Mosquitto, profile: Path) -> AsyncIterator[Page]:
+    """The page of a skin whose frames, health and contacts come, and nothing touches."""
+    async with viewing(mosquitto, "nobody", profile, watch=WATCH_SOCKETS) as seen:
         await seen.until("window.sockets.at(-1)?.readyState === 1")
         await seen.run(SERVER)
         await seen.run("setInterval(() => { pressed(0, 0); pressed(1, 0); health('tip', 0); }, 50)")
         await seen.run("contacts('palm', 'OFF'); contacts('wrist', 'OFF'); contacts('tip', 'OFF')")
+        yield seen
+
+
+async def test_a_force_that_is_only_a_bound_is_shown_as_one(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """Of skin beside dead pads, or pressed beyond its range; of a fingertip whose board is."""
+    async with untouched(mosquitto, tmp_path / "p") as seen:
 
         async def shows(part: str, cells: list[str], why: str, **changes: Any) -> None:
             contact = {
@@ -419,11 +426,7 @@ async def test_the_legend_of_the_forces_is_as_new_as_the_table(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
     """It was up to a tenth of a second older."""
-    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.at(-1)?.readyState === 1")
-        await seen.run(SERVER)
-        await seen.run("setInterval(() => { pressed(0, 0); pressed(1, 0); health('tip', 0); }, 50)")
-        await seen.run("contacts('palm', 'OFF'); contacts('wrist', 'OFF'); contacts('tip', 'OFF')")
+    async with untouched(mosquitto, tmp_path / "p") as seen:
         pairs = await seen.run(SAYS_THE_SAME)
         assert len({total for total, _ in pairs}) > 100
         assert [total for total, _ in pairs] == [total for _, total in pairs]
