@@ -139,10 +139,23 @@ def kept_from_children(*numbers: signal.Signals) -> Iterator[None]:
     `multiprocessing` unblocks SIGINT and SIGTERM (Python 3.11): call `start_tracker` before.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    # Another thread, which does not block them, may take them: a start that a handler leaves half
+    # way makes its program report an error.
+    came: list[int] = []
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:
+            # None is a handler that Python does not know.
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                handlers[number] = signal.signal(number, lambda number, _: came.append(number))
     try:
         yield
     finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for one in came:
+            signal.raise_signal(one)
 
 
 def end_with_parent() -> None:

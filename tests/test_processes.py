@@ -7,14 +7,15 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from skin_host.errors import SkinError
-from skin_host.processes import Processes
+from skin_host.processes import Processes, beside, kept_from_children
 from tests.support.moments import at_import
 from tests.support.waiting import PATIENCE_S, until
 
@@ -157,3 +158,56 @@ def test_ctrl_c_while_they_are_being_started_ends_them_without_a_word(tmp_path, 
         timeout=PATIENCE_S,
     )
     assert (ended.returncode, ended.stderr) == (130, "")
+
+
+class HangupError(Exception):
+    """SIGHUP came."""
+
+
+@pytest.fixture
+def hangups_raise() -> Iterator[None]:
+    """A thread takes them that does not block them, as those of numpy do not."""
+
+    def hang_up(number: int, _: object) -> None:
+        raise HangupError
+
+    over = threading.Event()
+    thread = threading.Thread(target=over.wait)
+    thread.start()
+    before = signal.signal(signal.SIGHUP, hang_up)
+    yield
+    signal.signal(signal.SIGHUP, before)
+    over.set()
+    thread.join()
+
+
+class StartsAsAsked(multiprocessing.get_context("spawn").Process):
+    """The terminal is closed just before it starts."""
+
+    def start(self) -> None:
+        os.kill(os.getpid(), signal.SIGHUP)
+        time.sleep(0.05)
+        super().start()
+
+
+@pytest.mark.usefixtures("hangups_raise")
+def test_processes_that_are_being_started_as_a_terminal_is_closed_end_without_a_word(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Of a start that is left half way the child would print a traceback."""
+    process = StartsAsAsked(target=time.sleep, args=(PATIENCE_S,), daemon=True)
+    with pytest.raises(HangupError), beside([process]):
+        pass
+    assert process.pid is not None
+    assert process.exitcode == -signal.SIGTERM
+    assert capfd.readouterr().err == ""
+
+
+def test_a_signal_that_is_ignored_is_still_ignored_after_a_start() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with kept_from_children(signal.SIGHUP):
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)

@@ -455,8 +455,10 @@ def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
 
 def _shown(host: str) -> str:
     """Return the address of our host as a browser on this machine writes it."""
-    if host in ("", "0.0.0.0", "::"):  # noqa: S104  # shown, not bound
+    if host in ("", "0.0.0.0"):  # noqa: S104  # shown, not bound
         return "localhost"
+    if host == "::":
+        host = "::1"  # "localhost" is the address of IPv4, too, on which nothing listens
     return f"[{host}]" if ":" in host else host
 
 

@@ -172,7 +172,8 @@ async def test_a_broker_that_ends_every_connection_fills_no_log(
         await until(lambda: broker.connections >= 20)
         assert "QoS 1" in publisher.counters.last_error
         assert not publisher.counters.name_taken
-    assert len(lines(caplog)) <= 3
+        # What the stop reports depends on whether a connection stands just then.
+        assert len(lines(caplog)) <= 3
 
 
 async def test_an_acknowledgement_that_drips_is_given_up_in_a_line(
@@ -235,8 +236,8 @@ async def test_a_broker_that_never_takes_the_status_is_named_for_that_in_a_line(
         assert counters.last_error.endswith(f"when this is published: {topic}")
         assert not counters.name_taken
         assert counters.withheld == []
-    assert sum(topic in line for line in lines(caplog)) == 1
-    assert len(lines(caplog)) <= 3
+        assert sum(topic in line for line in lines(caplog)) == 1
+        assert len(lines(caplog)) <= 3
 
 
 @pytest.mark.usefixtures("hasty")

@@ -7,7 +7,7 @@ import urllib.request
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from socket import gethostname
+from socket import AF_INET6, create_server, gethostname
 from typing import Any
 
 import msgspec
@@ -37,6 +37,13 @@ from tests.support.waiting import PATIENCE_S, until
 
 PAGE = Path(server.__file__).parent / "page"
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+
+
+def has_ipv6() -> bool:
+    """Whether this machine has an address of IPv6: some containers have none."""
+    with suppress(OSError), create_server(("::1", 0), family=AF_INET6):
+        return True
+    return False
 
 
 def nowhere() -> str:
@@ -197,6 +204,14 @@ async def test_the_page_is_served_under_addresses_and_the_names_of_this_machine(
         assert (await fetch(url, Host=f"{own.partition('.')[0]}.local:8080"))[0] == 200
         assert (await fetch(url, Host="skin.example"))[0] == 200
         assert (await fetch(url, Host="other.example"))[0] == 403
+
+
+@pytest.mark.parametrize("host", ["", "0.0.0.0", "::", "::1", "127.0.0.1"])
+async def test_the_address_that_is_shown_is_one_on_which_the_page_is_served(host: str) -> None:
+    if ":" in host and not has_ipv6():
+        pytest.skip("no IPv6 here")
+    async with Viewer(nowhere(), robot="demo").serving(host, port=0) as url:
+        assert (await fetch(url))[0] == 200
 
 
 async def test_a_port_that_is_taken_is_told_in_one_line() -> None:
