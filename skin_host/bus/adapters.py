@@ -51,6 +51,8 @@ OPEN_S = 5.0
 CLOSE_S = 1.0
 #: A server of buses greets within this time.
 GREETING_S = 2.0
+#: If its computer answers nothing for so long, the connection has failed.
+VANISHED_S = 5
 #: Extras of python-can, by the interface that needs one.
 _EXTRAS = {
     "canalystii": "canalystii",
@@ -366,6 +368,8 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
                 ignore_config=True,
                 **options,  # type: ignore[arg-type]
             )
+            if settings.interface == SOCKETCAND:
+                _fail_if_it_vanishes(bus)
     except Exception as error:
         # Each adapter's library has its own errors; the user gets one kind.
         why = one_line(error)
@@ -395,6 +399,23 @@ def _await_greeting(options: Mapping[str, object]) -> None:
     with socket.create_connection((host, port), GREETING_S) as server:
         if not server.recv(16).startswith(b"< hi"):
             raise OSError("what listens there is no socketcand")
+
+
+def _fail_if_it_vanishes(bus: can.BusABC) -> None:
+    """Let the connection to a server of buses fail if its computer is cut off or loses its power.
+
+    Otherwise nothing fails: TCP waits for an answer to what was sent for a quarter of an hour, and
+    for the next frame for ever.
+    """
+    # python-can gives no other access to it. Where a version has none, the connection stays as it
+    # is.
+    connection = getattr(bus, "_SocketCanDaemonBus__socket", None)
+    if isinstance(connection, socket.socket):
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+        # In milliseconds; it holds for what was sent and for probes, however many these are.
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, VANISHED_S * 1000)
 
 
 def _leave_other_groups(bus: can.BusABC, group: str) -> None:

@@ -2,9 +2,9 @@
 
 A sweep is one board's values of one period. The frames have no sequence number and no guaranteed
 order, so the end of a sweep is inferred: a slot (triangle and half) that comes twice, a pause, the
-age of the sweep's first frame, or the usual first frame after late ones of the sweep before starts
-a new one. A sweep is returned as soon as every awaited triangle is complete. A triangle that has
-been missing for a while is no longer awaited, so that it causes no delay, until it sends again.
+age of the sweep's first frame, or the first frame after late ones of the sweep before starts a new
+one. A sweep is returned as soon as every awaited triangle is complete. A triangle that has been
+missing for a while is no longer awaited, so that it causes no delay, until it sends again.
 
 A board usually sends its frames in the same order. Once that order is known, a sweep or a run of
 frames in it is recognised by one comparison of bytes and copied as a whole; all other frames are
@@ -12,19 +12,18 @@ taken one by one, with the same result.
 """
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.bus.classes import BoardClasses, FrameCounters, FrameForms
+from skin_host.bus.order import SHORTEST_RUN, BoardOrder
+from skin_host.bus.periods import SET_BACK_NS, BoardPeriods
 from skin_host.bus.wire import (
     HEAD_BYTES,
-    HEADER_A,
-    HEADER_B,
-    MAIS_TYPES,
-    MAX_STANDARD_ID,
+    NO_STATUS,
     NS_PER_S,
     TAXELS,
     TRIANGLES,
@@ -35,13 +34,6 @@ from skin_host.bus.wire import (
 )
 from skin_host.layout import BoardLayout
 
-_T = TypeVar("_T", bound=np.generic)
-
-#: A board sends the frames of a sweep in a burst, so a frame begins the next sweep that comes later
-#: than this share of the period after the first of a sweep, and ...
-PAUSE_PERIODS = 0.5
-#: ... than this one after the last: measured from the last alone, a late frame would hide a pause.
-GAP_PERIODS = 1 / 3
 #: A triangle is awaited until it was missing in this many sweeps in a row.
 PATIENCE_SWEEPS = 3
 #: Expands a triangle's bit in a mask of triangles to its A and B bits in a mask of halves.
@@ -51,36 +43,7 @@ _PAYLOAD = 7
 _NOTHING = bytes(_PAYLOAD)
 _NO_STATUS = bytes(2 * TRIANGLES)
 _ALL_TRIANGLES = (1 << TRIANGLES) - 1
-#: The status words of a sweep without any.
-NO_STATUS = np.zeros(TRIANGLES, np.uint16)
-NO_STATUS.flags.writeable = False
 _NUMBERS = np.arange(TRIANGLES)
-_SMALLEST_DLC_B = 6
-#: Fewer frames are taken one by one: that costs no more. At a batch's end any number is a run, so
-#: that the rest of the sweep, with which the next batch begins, is one.
-_SHORTEST_RUN = 5
-#: What is stamped so much earlier than its sweep's first frame came after the clock was set back.
-_SET_BACK_NS = 100_000_000
-#: Where a frame's head has its length.
-_DLC_AT = 4
-#: Up to here heads identify a frame; then follows what is not read, and the header.
-_PAD_AT = 5
-#: After so many sweeps in another order than the known one, which lost frames cause too, the order
-#: is learnt again, after a pause of so many sweeps.
-_MOST_STRAY_SWEEPS = 4
-_LEARN_AFTER_SWEEPS = 64
-#: In which classes a board sends its A and its B frames, by the class that shows it: the stream,
-#: the legacy stream, and a special firmware, whose A frames are as those of the stream.
-_CLASSES: dict[int, tuple[MessageClass, MessageClass]] = {
-    MessageClass.SKIN_STREAM: (MessageClass.SKIN_STREAM, MessageClass.SKIN_STREAM),
-    MessageClass.ANALOG_STREAM: (MessageClass.ANALOG_STREAM, MessageClass.ANALOG_STREAM),
-    MessageClass.BATTERY_STREAM: (MessageClass.SKIN_STREAM, MessageClass.BATTERY_STREAM),
-}
-#: By the header of a frame, its half.
-_HALVES = {HEADER_A: 0, HEADER_B: 1}
-#: A board that has sent nothing for so many periods may send in the legacy class from then on. It
-#: pauses for fewer while it zeroes itself.
-_LEFT_PERIODS = 10
 _NEVER_NS = -(1 << 62)
 #: Classes in which boards answer.
 _ANSWERS = (MessageClass.ANALOG_COMMAND, MessageClass.MANAGEMENT)
@@ -124,22 +87,9 @@ class Assembled(NamedTuple):
 
 
 @dataclass(slots=True)
-class AssemblerCounters:
+class AssemblerCounters(FrameCounters):
     """Counts all frames that did not become part of a sweep, and everything that was missing."""
 
-    frames: int = 0
-    #: Frames outside the skin stream, as answers, other sensors and unconfigured nodes, also those
-    #: at a board's address in a class in which it does not send, and skin frames of boards that
-    #: others read.
-    other: int = 0
-    #: Of the configured force/torque boards.
-    force_torque: int = 0
-    wrong_header: int = 0
-    short: int = 0
-    #: Skin frames of a board that is not configured on this bus.
-    unknown_board: int = 0
-    #: Skin frames of a triangle that is not configured.
-    unknown_triangle: int = 0
     #: Frames of a triangle that was no longer awaited, too late for their sweep.
     late: int = 0
     #: Frames that came twice in a row.
@@ -153,146 +103,63 @@ class AssemblerCounters:
     missed: int = 0
 
 
-class _Order(NamedTuple):
-    """The order in which a board sends the frames of its sweeps.
-
-    Attributes:
-        heads: of all frames, `HEAD_BYTES` each.
-        places: of each frame, its place among the board's values.
-        first: the half of the first frame.
-        missing: masks of the halves that are missing before each frame, and after the last.
-        keys: what of the heads identifies the frames: identifier, DLC, and the data's header.
-        n: how many frames.
-        values: where `gathers` have the values: after the keys, before the status words.
-        no_status: the status words of a sweep without any.
-        triangles: those that it sends, in rising order; None for all.
-        gathers: by the size of a record and the place of its head, the places of the keys of all
-            frames, and of the values and then the status words of all triangles, among the octets
-            of a sweep.
-    """
-
-    heads: bytes
-    places: list[int]
-    first: int
-    missing: list[int]
-    keys: bytes
-    n: int
-    values: slice
-    no_status: bytes
-    triangles: NDArray[np.intp] | None
-    gathers: dict[tuple[int, int], NDArray[np.intp]]
-
-    @classmethod
-    def of(cls, heads: Sequence[bytes], places: Sequence[int], missing: Sequence[int]) -> "_Order":
-        triangles = np.array(sorted({place // 2 for place in places}), np.intp)
-        n = len(places)
-        keys = b"".join(head[:_PAD_AT] + head[-1:] for head in heads)
-        return cls(
-            b"".join(heads),
-            list(places),
-            1 << places[0] // 2 + places[0] % 2 * TRIANGLES,
-            [*missing, 0],
-            keys,
-            n,
-            slice(len(keys), len(keys) + n // 2 * TAXELS),
-            bytes(n),
-            None if len(triangles) == TRIANGLES else triangles,
-            {},
-        )
-
-    def gather(self, size: int, head: int) -> NDArray[np.intp]:
-        """Return the one of `gathers` for records of this form."""
-        found = self.gathers.get((size, head))
-        if found is None:
-            data = head + HEAD_BYTES
-            begins = {place: number * size for number, place in enumerate(self.places)}
-            triangles = sorted({place // 2 for place in self.places})
-            places: list[int] = []
-            for number in range(len(self.places)):
-                begin = number * size + head
-                places += [*range(begin, begin + _PAD_AT), begin + HEAD_BYTES - 1]
-            for triangle in triangles:
-                for half, count in enumerate((VALUES_A, TAXELS - VALUES_A)):
-                    begin = begins[2 * triangle + half] + data
-                    places += range(begin, begin + count)
-            for triangle in triangles:
-                begin = begins[2 * triangle + 1] + data + TAXELS - VALUES_A
-                places += begin, begin + 1
-            found = self.gathers[size, head] = np.array(places, np.intp)
-        return found
-
-
 @dataclass(slots=True)
 class _BoardState:
     """One board's sweep in progress; masks have bits 0-15 for A frames, 16-31 for B frames.
 
     Attributes:
         wanted: halves that the configured triangles send.
-        classes: of its A and of its B frames.
-        without_b: sweeps in succession that had A frames alone; of the first ones, one is enough.
         awaited: halves without which a sweep is not complete.
         missing: halves of `awaited` that have not arrived; 0 between sweeps.
         values: received bytes of each triangle, A and B in turn.
-        order: in which it sends, once that is known.
-        came: (head, place, missing before it) of the frames of a sweep from which it is learnt.
-        lone: halves of the last sweep of which the other has not come.
-        done: frames of the sweep that came in this order; the next has the place `expected`, which
-            is -1 while runs are not looked for.
+        came: (head, place, missing before it) of the frames of a sweep from which the order is
+            learnt.
+        sent: halves of the last sweep that came.
+        lone: those of them of which the other has not come.
+        done: frames of the sweep that came in the known order; the next has the place `expected`,
+            which is -1 while runs are not looked for.
         begun: the frames so far, as records, of a sweep that batches divide and that came in this
             order from its first frame; their payloads are not among `values` yet.
-        stray: sweeps in succession with frames in another order.
-        learn_after: so many sweeps pass before the order is learnt.
         crowded: see `Sweep`, since the last one that was returned.
         first: the half with which the sweep began.
         usual: that of the last sweep of which no half was missing; 0 while there is none.
+        lasted_ns: how long the last such sweep lasted whose frames were not taken together.
         amid: whether the sweep began with another half than the usual one.
-        sent_last_ns, sent_before_ns: time of the last frame of the last sweep, and of the one
-            before.
-        missed: see `Sweep`, of the last sweep.
-        set_ns: by how much the clock was set since the last sweep before that.
     """
 
     index: int
-    period_ns: int
-    pause_ns: int
-    gap_ns: int
-    close_ns: int
     wanted: int
     awaited: int
-    classes: tuple[MessageClass, MessageClass] = _CLASSES[MessageClass.SKIN_STREAM]
-    without_b: int = PATIENCE_SWEEPS - 1
+    classes: BoardClasses
+    periods: BoardPeriods
+    order: BoardOrder = field(default_factory=BoardOrder)
     missing: int = 0
     first_ns: int = 0
     last_ns: int = _NEVER_NS
     certain_until_ns: int = 0
     sent: int = 0
-    lone: int = 0
     sent_first_ns: int = _NEVER_NS
-    sent_last_ns: int = 0
-    sent_before_ns: int = 0
-    missed: int = 0
-    set_ns: int = 0
+    lone: int = 0
     last_place: int = -1
     values: list[bytes] = field(default_factory=lambda: [_NOTHING] * 2 * TRIANGLES)
     absent_for: list[int] = field(default_factory=lambda: [0] * TRIANGLES)
     any_absent: bool = False
-    order: _Order | None = None
     came: list[tuple[bytes, int, int]] | None = None
     done: int = 0
     expected: int = -1
     begun: bytes = b""
-    stray: int = 0
-    learn_after: int = 1
     crowded: bool = False
     first: int = 0
     usual: int = 0
+    lasted_ns: int = 0
     amid: bool = False
 
     def unpack(self) -> None:
         """Take the payloads of the frames in `begun`."""
-        if self.order is not None and self.begun:
+        order = self.order.known
+        if order is not None and self.begun:
             size = len(self.begun) // self.done
-            for number, place in enumerate(self.order.places[: self.done], 1):
+            for number, place in enumerate(order.places[: self.done], 1):
                 self.values[place] = self.begun[number * size - _PAYLOAD : number * size]
         self.begun = b""
 
@@ -321,10 +188,10 @@ class Assembler:
     ) -> None:
         self.counters = AssemblerCounters()
         self.stranger_id: int | None = None
-        self.unconfigured: Counter[int] = Counter()
-        self._force_torque = force_torque
-        self._others = others
         self._states: dict[int, _BoardState] = {}
+        addresses = frozenset(board.settings.address for _, board in boards)
+        self._forms = FrameForms(self.counters, addresses, others, force_torque)
+        self.unconfigured = self._forms.unconfigured
         # For identifier << 8 | header byte of each frame that a configured triangle sends, in the
         # classes of its board: the board, the place among its values, and the bit in its masks.
         self._slots: dict[int, tuple[_BoardState, int, int]] = {}
@@ -335,22 +202,18 @@ class Assembler:
         #: No sweep in progress is too old up to here, on the clock of the frames.
         self._none_old_until_ns = _NEVER_NS
         for index, board in boards:
-            period_ns = board.settings.period_ms * 1_000_000
-            wanted = 0
-            for triangle in board.triangles:
-                wanted |= _BOTH << triangle
+            address, period_ns = board.settings.address, board.settings.period_ms * 1_000_000
+            triangles = sum(1 << triangle for triangle in board.triangles)
             state = _BoardState(
                 index,
-                period_ns,
-                int(PAUSE_PERIODS * period_ns),
-                int(GAP_PERIODS * period_ns),
-                int(close_periods * period_ns),
-                wanted,
-                wanted,
+                triangles * _BOTH,
+                triangles * _BOTH,
+                BoardClasses(address, triangles, period_ns),
+                BoardPeriods.of(period_ns, close_periods),
             )
-            self._states[board.settings.address] = state
-            self._add_slots(board.settings.address, state)
-        closes_ns = [state.close_ns for state in self._states.values()]
+            self._states[address] = state
+            self._add_slots(state)
+        closes_ns = [state.periods.close_ns for state in self._states.values()]
         self._longest_close_ns = max(closes_ns, default=0)
 
     def feed(self, batch: FrameBatch) -> Assembled:
@@ -362,7 +225,7 @@ class Assembler:
         motors: list[int] = []
         if not batch:
             return Assembled(sweeps, answers)
-        slots = self._slots
+        slots, half_of = self._slots, self._forms.half_of
         records = batch.records()
         octets, form, head_at = records
         n = len(octets)
@@ -394,7 +257,8 @@ class Assembler:
                 slot = slots.get(identifier << 8 | header)
                 if slot is None or dlc < 8:
                     t_ns = seconds * NS_PER_S + nanoseconds
-                    if not self._usable(identifier, dlc, header, t_ns, sweeps):
+                    half = half_of(identifier, dlc, header)
+                    if half is None or not self._is_of_skin(identifier, half, t_ns, sweeps):
                         message_class = identifier >> 8
                         if message_class in _ANSWERS:
                             answers.append((identifier, (bytes((header,)) + payload)[:dlc]))
@@ -440,7 +304,7 @@ class Assembler:
         """
         sweeps: list[Sweep] = []
         for state in self._states.values():
-            if state.missing and now_ns - state.first_ns > state.close_ns:
+            if state.missing and now_ns - state.first_ns > state.periods.close_ns:
                 self._close(state, sweeps)
         return sweeps
 
@@ -451,7 +315,7 @@ class Assembler:
             step_ns: by how much it was set, negative if back. Frames of the time before may follow.
         """
         for state in self._states.values():
-            state.set_ns += step_ns
+            state.periods.set_ns += step_ns
 
     def flush(self) -> list[Sweep]:
         """Return all sweeps in progress, at the end of a recording."""
@@ -460,107 +324,39 @@ class Assembler:
             self._count_lone(state)
         return sweeps
 
-    def _add_slots(self, address: int, state: _BoardState) -> None:
-        for triangle in range(TRIANGLES):
-            if state.wanted >> triangle & 1:
-                for header, half in _HALVES.items():
-                    key = (state.classes[half] << 8 | address << 4 | triangle) << 8 | header
-                    bit = 1 << triangle + half * TRIANGLES
-                    self._slots[key] = state, 2 * triangle + half, bit
-
-    def _usable(
-        self, identifier: int, dlc: int, header: int, t_ns: int, sweeps: list[Sweep]
-    ) -> bool:
-        """Count a frame that is not a complete one of a configured triangle in its board's classes.
-
-        Returns whether it is a configured triangle's after all: a B frame that only lacks its
-        status, or the first in a class in which its board sends from now on.
-        """
-        counters = self.counters
-        message_class = identifier >> 8
-        is_skin = message_class == MessageClass.SKIN_STREAM
-        half = _HALVES.get(header)
-        if identifier in self._force_torque:
-            counters.force_torque += 1
-        elif dlc == 0 or identifier > MAX_STANDARD_ID:
-            counters.other += 1
-        elif is_skin and half is None:
-            counters.wrong_header += 1
-        elif is_skin and dlc < (_SMALLEST_DLC_B if half else 8):
-            counters.short += 1
-        elif (
-            half is None
-            or message_class not in _CLASSES
-            or message_class != _CLASSES[message_class][half]
-            # Other sensors use the legacy class too, most with fewer bytes.
-            or (dlc < 8 and not is_skin)
-            or self._may_be_mais(identifier)
-        ):
-            counters.other += 1
-        else:
-            return self._is_of_skin(identifier, half, t_ns, sweeps)
-        return False
-
-    def _may_be_mais(self, identifier: int) -> bool:
-        """Whether a frame may be of joints: no skin board is configured at its address."""
-        legacy = identifier >> 8 == MessageClass.ANALOG_STREAM and identifier & 0xF in MAIS_TYPES
-        return legacy and identifier >> 4 & 0xF not in self._states
+    def _add_slots(self, state: _BoardState) -> None:
+        for key, triangle, half in state.classes.slots():
+            self._slots[key] = state, 2 * triangle + half, 1 << triangle + half * TRIANGLES
 
     def _is_of_skin(self, identifier: int, half: int, t_ns: int, sweeps: list[Sweep]) -> bool:
         """Return whether a frame with the form of a half is that of a configured triangle, in whose
         class its board then sends; count it otherwise.
         """
-        address, triangle = identifier >> 4 & 0xF, identifier & 0xF
-        state = self._states.get(address)
-        if state is None:
-            if address in self._others:
-                self.counters.other += 1
-            else:
-                self.counters.unknown_board += 1
-                self.unconfigured[address] += 1
-        elif not self._may_send_in(state, identifier >> 8, half, t_ns):
+        state = self._states[identifier >> 4 & 0xF]
+        has_b = state.missing != 0 and (state.awaited & ~state.missing) >> TRIANGLES != 0
+        quiet_ns = abs(t_ns - state.last_ns)
+        if not state.classes.may_be_of(identifier, half, quiet_ns, has_b=has_b):
             self.counters.other += 1
-        elif not state.wanted >> triangle & 1:
+        elif not state.wanted >> (identifier & 0xF) & 1:
             self.counters.unknown_triangle += 1
         else:
-            if identifier >> 8 != state.classes[half]:
-                self._change_classes(address, identifier >> 8, sweeps)
+            if identifier >> 8 != state.classes.halves[half]:
+                self._change_classes(state, identifier >> 8, sweeps)
             return True
         return False
 
-    @staticmethod
-    def _may_send_in(state: _BoardState, message_class: int, half: int, t_ns: int) -> bool:
-        """Return whether a frame of this class, which other sensors use too, may be of a board.
-
-        Nothing else sends in the class of the stream. So a board that does so is of the special
-        firmware only if all its B frames are missing there, and of the legacy stream only if
-        nothing comes there.
-        """
-        if message_class in (state.classes[half], MessageClass.SKIN_STREAM):
-            return True
-        if message_class == MessageClass.ANALOG_STREAM:
-            return abs(t_ns - state.last_ns) > _LEFT_PERIODS * state.period_ns
-        came = state.awaited & ~state.missing if state.missing else 0
-        return (
-            state.classes[0] == MessageClass.SKIN_STREAM
-            and state.without_b >= PATIENCE_SWEEPS
-            and not came >> TRIANGLES
-        )
-
-    def _change_classes(self, address: int, message_class: int, sweeps: list[Sweep]) -> None:
+    def _change_classes(self, state: _BoardState, message_class: int, sweeps: list[Sweep]) -> None:
         """A board sends in other classes from now on: nothing that came before joins it."""
-        state = self._states[address]
         if message_class != MessageClass.BATTERY_STREAM:
             if state.missing:
                 self._close(state, sweeps)
             self._count_lone(state)
             state.sent_first_ns, state.last_place = _NEVER_NS, -1
-        state.order = state.came = None
-        state.expected, state.stray, state.learn_after = -1, 0, 1
-        for key in [key for key, (of, _, _) in self._slots.items() if of is state]:
+        state.order, state.came, state.expected = BoardOrder(), None, -1
+        for key, _, _ in state.classes.slots():
             del self._slots[key]
-        state.classes = _CLASSES[message_class]
-        self._add_slots(address, state)
+        state.classes.change_to(message_class)
+        self._add_slots(state)
 
     def _is_doubled(self, state: _BoardState, bit: int, payload: bytes, t_ns: int) -> bool:
         """Count the frame that the board sent last, if it comes once more.
@@ -570,7 +366,7 @@ class Assembler:
         """
         first_ns = state.first_ns if state.missing else state.sent_first_ns
         same = not bit & state.missing and state.values[state.last_place] == payload
-        if not same or not 0 <= t_ns - first_ns <= state.pause_ns:
+        if not same or not 0 <= t_ns - first_ns <= state.periods.pause_ns:
             return False
         self.counters.doubled += 1
         return True
@@ -579,11 +375,10 @@ class Assembler:
     def _expect_order(state: _BoardState) -> None:
         """A sweep begins: expect its frames in the known order, or learn the order from it."""
         state.came = None
-        if state.order is not None:
-            state.done, state.expected = 1, state.order.places[1]
-        elif state.learn_after:
-            state.learn_after -= 1
-        elif state.awaited == state.wanted:
+        order = state.order
+        if order.known is not None:
+            state.done, state.expected = 1, order.known.places[1]
+        elif order.begin_sweep() and state.awaited == state.wanted:
             state.came = []
 
     def _take_sweep(
@@ -602,10 +397,11 @@ class Assembler:
             at: number of the first frame.
             sweeps: what is extended by the sweep.
         """
-        order = state.order
+        order = state.order.known
         if order is None:
             return 0
         octets, form, head = records
+        periods = state.periods
         places, size = order.places, form.size
         done = state.done if state.begun else 0
         n = order.n - done
@@ -635,8 +431,8 @@ class Assembler:
                 state.missing
                 or state.sent != state.awaited
                 or order.missing[0] != state.awaited
-                or last_ns - first_ns > min(state.pause_ns, state.close_ns)
-                or 0 < 2 * (first_ns - state.sent_first_ns) < state.period_ns
+                or last_ns - first_ns > periods.sure_ns
+                or 0 < 2 * (first_ns - state.sent_first_ns) < periods.period_ns
                 or state.last_place == places[0]
             ):
                 return 0
@@ -648,45 +444,34 @@ class Assembler:
                 self._close_old(first_ns, sweeps)
                 state.first_ns = first_ns
                 state.first, state.amid = order.first, False
-                state.certain_until_ns = first_ns + min(state.pause_ns, state.close_ns)
+                state.certain_until_ns = first_ns + periods.sure_ns
             done += n
             state.begun += text[begin:]
             state.done, state.expected = done, places[done]
             state.missing = order.missing[done]
             state.last_place, state.last_ns = places[done - 1], last_ns
-            state.stray = 0
+            state.order.stray = 0
             self._cut = state
             return n
         if done:
             frames = np.frombuffer(state.begun + text[begin:end], np.uint8)
         else:
             frames = np.frombuffer(text, np.uint8, end - begin, begin)
-        # One call of numpy for all that is needed of the frames.
-        got = frames[order.gather(size, head)]
-        line = got.tobytes()
-        if not line.startswith(order.keys):
+        found = order.values_of(frames, size, head)
+        if found is None:
             return 0
-        raw = got[order.values].reshape(-1, TAXELS)
-        status = NO_STATUS
-        if not line.endswith(order.no_status):
-            status = got[order.values.stop :].view(">u2").astype(np.uint16)
-        if order.triangles is not None:
-            raw = _spread(raw, order.triangles)
-            if status is not NO_STATUS:
-                status = _spread(status, order.triangles)
+        raw, status = found
         state.values[places[-1]] = payload
         state.last_place = places[-1]
         state.usual = order.first
-        state.stray = 0
+        state.order.stray = 0
         if done:
             state.begun, state.missing, state.expected = b"", 0, -1
         else:
             self._close_old(first_ns, sweeps)
-        missed = self._count_sweep(state, last_ns)
-        if state.any_absent:
-            state.absent_for = [0] * TRIANGLES
-            state.any_absent = False
-        present = state.awaited & _ALL_TRIANGLES
+        self.counters.sweeps += 1
+        self.counters.missed += periods.note(last_ns)
+        present, missed = state.awaited & _ALL_TRIANGLES, periods.missed
         sweeps.append(Sweep(state.index, raw, status, present, last_ns, missed, state.crowded))
         state.crowded = False
         state.first_ns = state.sent_first_ns = first_ns
@@ -700,7 +485,7 @@ class Assembler:
 
         They are taken if none of them would need a closer look alone.
         """
-        order = state.order
+        order = state.order.known
         assert order is not None
         done = state.done
         left = len(records.octets) - at
@@ -710,9 +495,11 @@ class Assembler:
         if state.missing != order.missing[done] or not heads.startswith(
             order.heads[begin:end], at * HEAD_BYTES
         ):
-            self._note_stray(state)
+            state.order.note_stray()
             return 0
-        if n < _SHORTEST_RUN and n < left:
+        # At a batch's end any number is a run, so that the rest of the sweep, with which the next
+        # batch begins, is one.
+        if n < SHORTEST_RUN and n < left:
             return 0
         size = records.form.size
         last = records.form.unpack_from(records.octets.data, (at + n - 1) * size)
@@ -727,19 +514,12 @@ class Assembler:
         state.last_place = places[-1]
         state.last_ns = t_ns
         state.missing = order.missing[done]
-        state.stray = 0
+        state.order.stray = 0
         if state.missing:
             state.done, state.expected = done, order.places[done]
         else:
             self._close(state, sweeps)
         return n
-
-    @staticmethod
-    def _note_stray(state: _BoardState) -> None:
-        """A sweep did not come in the known order."""
-        state.stray += 1
-        if state.stray == _MOST_STRAY_SWEEPS:
-            state.order, state.stray, state.learn_after = None, 0, _LEARN_AFTER_SWEEPS
 
     def _belongs(self, state: _BoardState, bit: int, t_ns: int, sweeps: list[Sweep]) -> bool:
         """Handle a frame that is not the next one of a sweep in progress.
@@ -747,19 +527,22 @@ class Assembler:
         It may begin a sweep, which ends the one before, or belong to a triangle that was not
         awaited. Returns False if it came too late for its sweep.
         """
+        periods = state.periods
         came = state.awaited & ~state.missing if state.missing else 0
-        begins = state.amid and bit == state.usual and self._is_after_late(state, came, t_ns)
+        # That lacks them all: those that came may be late ones of the sweep before.
+        late = state.amid and came and not came & state.sent
+        begins = late and self._begins_after_late(state, came, bit, t_ns)
         if (
             came.bit_count() == 1
-            and max(state.sent_last_ns, state.sent_before_ns) <= t_ns < state.first_ns
+            and max(periods.last_ns, periods.before_ns) <= t_ns < state.first_ns
         ):
             # The first frame's stamp was ahead. By that, the sweep would last into the next one.
             state.first_ns = state.last_ns = t_ns
         if state.missing and (
             begins
             or came & bit
-            or t_ns > self._ends_ns(state, state.first_ns, state.last_ns)
-            or t_ns < state.first_ns - _SET_BACK_NS
+            or t_ns > periods.ends_ns(state.first_ns, state.last_ns)
+            or t_ns < state.first_ns - SET_BACK_NS
         ):
             self._close(state, sweeps)
         if not bit & state.awaited:
@@ -771,14 +554,14 @@ class Assembler:
                 state.missing |= both
         if not state.missing:
             since_ns = t_ns - state.sent_first_ns
-            is_near = -_SET_BACK_NS <= since_ns <= state.pause_ns
+            is_near = -SET_BACK_NS <= since_ns <= periods.pause_ns
             if not (bit & state.sent or begins) and is_near:
                 # Its sweep was returned without it: the triangle was not awaited, or the frame was
                 # held up for longer than a sweep is waited for.
                 self.counters.late += 1
                 state.lone &= ~(bit << TRIANGLES | bit >> TRIANGLES)
                 return False
-            if bit & state.sent and 0 < 2 * (t_ns - state.sent_first_ns) < state.period_ns:
+            if bit & state.sent and 0 < 2 * since_ns < periods.period_ns:
                 state.crowded = True
             if state.lone:
                 self._count_lone(state)
@@ -787,32 +570,26 @@ class Assembler:
             state.first_ns = t_ns
             state.first, state.amid = bit, state.usual not in (0, bit)
             self._expect_order(state)
-        ends_ns = self._ends_ns(state, state.first_ns, t_ns)
+        ends_ns = periods.ends_ns(state.first_ns, t_ns)
         if state.amid:
             # Until then the usual first frame begins no other.
             came = state.awaited & ~state.missing | bit
-            ends_ns = min(ends_ns, state.first_ns + self._slowest_ns(state, came))
+            ends_ns = min(ends_ns, state.first_ns + periods.slowest_ns(came.bit_count()))
         state.certain_until_ns = ends_ns
         return True
 
-    def _is_after_late(self, state: _BoardState, came: int, t_ns: int) -> bool:
-        """Return whether the halves that came of a sweep in progress are of the one before, and
-        late, or stamped as if they were: that lacks them all, and no board sends so slowly.
+    @staticmethod
+    def _begins_after_late(state: _BoardState, came: int, bit: int, t_ns: int) -> bool:
+        """Return whether a frame begins a sweep, and those that came of one in progress are late
+        ones, or stamped as if they were: no board sends so slowly.
+
+        It is the usual first one or, where that is late as well, one that the sweep before had, if
+        more time passed than a sweep lasts.
         """
-        if not came or came & state.sent:
+        passed_ns = abs(t_ns - state.first_ns)
+        if passed_ns <= state.periods.slowest_ns(came.bit_count()):
             return False
-        return abs(t_ns - state.first_ns) > self._slowest_ns(state, came)
-
-    @staticmethod
-    def _slowest_ns(state: _BoardState, came: int) -> int:
-        """Return how long the slowest board, whose sweeps take all of a period, sends so many."""
-        return came.bit_count() * state.period_ns // (2 * TRIANGLES)
-
-    @staticmethod
-    def _ends_ns(state: _BoardState, first_ns: int, last_ns: int) -> int:
-        """Return until when frames belong to a sweep with such a first and last frame."""
-        paused_ns = max(first_ns + state.pause_ns, last_ns + state.gap_ns)
-        return min(paused_ns, first_ns + state.close_ns)
+        return bit == state.usual or (bit & state.sent != 0 and passed_ns > state.lasted_ns)
 
     def _close_old(self, now_ns: int, sweeps: list[Sweep]) -> None:
         """End sweeps whose time has passed when another begins, which may be read much later.
@@ -825,7 +602,7 @@ class Assembler:
             return
         sweeps += self.expire(now_ns)
         self._none_old_until_ns = min(
-            (state.first_ns if state.missing else now_ns) + state.close_ns
+            (state.first_ns if state.missing else now_ns) + state.periods.close_ns
             for state in self._states.values()
         )
 
@@ -839,14 +616,15 @@ class Assembler:
         if state.begun:
             state.unpack()
         got = state.awaited & ~state.missing
-        state.without_b = 0 if got >> TRIANGLES else state.without_b + 1
+        state.classes.note_sweep(has_b=got >> TRIANGLES != 0)
         present = got & got >> TRIANGLES
-        missed = self._count_sweep(state, state.last_ns)
+        self.counters.sweeps += 1
+        self.counters.missed += state.periods.note(state.last_ns)
         values = np.frombuffer(bytearray().join(state.values), np.uint8)
         triangles = values.reshape(TRIANGLES, 2 * _PAYLOAD)
         if state.expected >= 0:
             # The second frame of the known order came first, or not at all.
-            self._note_stray(state)
+            state.order.note_stray()
             state.expected = -1
         if got != state.wanted:
             self.counters.incomplete += state.missing != 0
@@ -860,52 +638,22 @@ class Assembler:
                 state.absent_for = [0] * TRIANGLES
                 state.any_absent = False
             state.usual = state.first
+            state.lasted_ns = state.last_ns - state.first_ns
             if state.came is not None:
-                self._learn_order(state, state.came)
+                order = state.order.learn(state.came)
+                if order is not None:
+                    self._first[order.heads[:HEAD_BYTES]] = state
+                state.came = None
         if present:
             raw, status = triangles[:, :TAXELS], NO_STATUS
             if triangles[:, TAXELS:].tobytes() != _NO_STATUS:
                 status = triangles[:, TAXELS:].copy().view(">u2")[:, 0].astype(np.uint16)
-            t_ns = state.last_ns
+            t_ns, missed = state.last_ns, state.periods.missed
             sweeps.append(Sweep(state.index, raw, status, present, t_ns, missed, state.crowded))
             state.crowded = False
         state.sent = got
         state.sent_first_ns = state.first_ns
         state.missing = 0
-
-    def _count_sweep(self, state: _BoardState, last_ns: int) -> int:
-        """Count a sweep and those missed since the board's last one; return the latter."""
-        missed = 0
-        passed_ns = last_ns - state.sent_last_ns
-        if abs(passed_ns) > _SET_BACK_NS:
-            # A time that is far from those before and after it, which are near each other, is a
-            # damaged stamp: no time passed up to it, or from it on.
-            since_ns = last_ns - state.sent_before_ns
-            if abs(since_ns) < min(abs(passed_ns), abs(passed_ns - since_ns)):
-                self.counters.missed -= state.missed
-                passed_ns, state.sent_last_ns = since_ns, state.sent_before_ns
-        state.sent_before_ns, state.sent_last_ns = state.sent_last_ns, last_ns
-        if state.set_ns:
-            unset_ns = passed_ns - state.set_ns
-            # Not so while sweeps follow that were stamped before the clock was set.
-            if abs(unset_ns - state.period_ns) < abs(passed_ns - state.period_ns):
-                passed_ns, state.set_ns = unset_ns, 0
-        if state.sent_before_ns and 2 * passed_ns >= 3 * state.period_ns:
-            missed = round(passed_ns / state.period_ns) - 1
-            self.counters.missed += missed
-        state.missed = missed
-        self.counters.sweeps += 1
-        return missed
-
-    def _learn_order(self, state: _BoardState, came: list[tuple[bytes, int, int]]) -> None:
-        """Note the order of a complete sweep, if its frames are of full length."""
-        state.came = None
-        heads, places, missing = zip(*came, strict=True)
-        if len(places) < _SHORTEST_RUN or any(head[_DLC_AT] < 8 for head in heads):
-            state.learn_after = _LEARN_AFTER_SWEEPS
-            return
-        state.order = _Order.of(heads, places, missing)
-        self._first[heads[0]] = state
 
     @staticmethod
     def _note_absent(state: _BoardState, present: int) -> None:
@@ -925,10 +673,3 @@ def _without(bits: int) -> NDArray[np.bool_]:
     """Return which triangles bool[16] have no bit in a mask."""
     missing: NDArray[np.bool_] = bits >> _NUMBERS & 1 == 0
     return missing
-
-
-def _spread(array: NDArray[_T], triangles: NDArray[np.intp]) -> NDArray[_T]:
-    """Return the rows of some triangles [m, ...] among those of all, [16, ...]; others are 0."""
-    spread = np.zeros((TRIANGLES, *array.shape[1:]), array.dtype)
-    spread[triangles] = array
-    return spread

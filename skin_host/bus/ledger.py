@@ -17,8 +17,9 @@ from statistics import median
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.assembler import NO_STATUS, Sweep
+from skin_host.bus.assembler import Sweep
 from skin_host.bus.wire import (
+    NO_STATUS,
     TAXELS,
     TRIANGLE_BITS,
     TRIANGLES,

@@ -77,6 +77,9 @@ _RECORD_ARRAY = np.dtype(
 _SLICE_BITS = 44
 #: Bytes of `struct can_frame` up to the first byte of data, the header.
 HEAD_BYTES = 9
+#: The status words of a sweep without any.
+NO_STATUS = np.zeros(TRIANGLES, np.uint16)
+NO_STATUS.flags.writeable = False
 
 
 class Records(NamedTuple):

@@ -49,6 +49,9 @@ from skin_host.processes import beside
 #: Rooms by the beginning of a module's name; the first that fits counts.
 ROOMS = {
     "skin_host.bus.assembler": "assembler",
+    "skin_host.bus.classes": "assembler",
+    "skin_host.bus.order": "assembler",
+    "skin_host.bus.periods": "assembler",
     "skin_host.bus": "bus",
     "skin_host.daemon.link": "bus",
     "skin_host.clock": "bus",

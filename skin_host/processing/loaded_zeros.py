@@ -4,8 +4,8 @@ When the load lifts, its taxels read below their zeros, to which nothing can pre
 
 - Single taxels may bulge beside a touch for a while. Where they stay low, their baselines follow;
   `drift` decides that.
-- Where most of a part reads so, even for the moment between two steps, nothing but a load has
-  lifted: the baselines follow at once.
+- Where most of a part reads so, or a quarter of one that nothing touches, even for the moment
+  between two steps, nothing but a load has lifted: the baselines follow at once.
 
 What then returns to where its baseline was is that load again, or was pulled down and is free. No
 reading shows which, until it falls again: then it was a load.
@@ -45,7 +45,7 @@ class LoadedZeros:
 
     def __init__(self, n: int) -> None:
         self.returned: Mask = np.zeros(n, np.bool_)
-        #: For how long it yet counts that each taxel read below its zero as most of the part did.
+        #: For how long it yet counts that each taxel read below its zero as much of the part did.
         self._below_s: Array = np.zeros(n)
         #: The baselines before they fell, and for how long their taxels may yet return.
         self._former: Array = np.zeros(n)
@@ -59,8 +59,8 @@ class LoadedZeros:
     def lifted(
         self, low: Array, noise: Array | float, touched: Mask, received: Mask, dt_s: float
     ) -> Mask | None:
-        """Return from which taxels [n] a load has lifted that pressed most of the part when its
-        zeros were taken, or None: in two windows most of it has read below its zeros.
+        """Return from which taxels [n] a load has lifted that pressed much of the part when its
+        zeros were taken, or None: in two windows so much of it has read below its zeros.
 
         Args:
             low: lowest reading [n] of each in a window, relaxation included: no model of the foam
@@ -71,12 +71,16 @@ class LoadedZeros:
             dt_s: its length.
         """
         below = (low < FALLEN_UNITS) & received
-        surely = np.count_nonzero(below & (low + LOWEST_DEVIATIONS * noise < FALLEN_UNITS))
-        bulged = BULGED * np.count_nonzero(touched & ~below)
-        if surely <= max(np.count_nonzero(received) // 2, bulged):
+        surely = below & (low + LOWEST_DEVIATIONS * noise < FALLEN_UNITS)
+        n, fallen = int(np.count_nonzero(received)), int(np.count_nonzero(surely))
+        pressed = int(np.count_nonzero(touched & ~below))
+        most = fallen > max(n // 2, BULGED * pressed)
+        # Beside what touches another part no more than the edge of this one may bulge.
+        if not most and (pressed or fallen <= max(n // 4, BULGED)):
             self._below_s -= dt_s
             return None
-        lifted = below & (self._below_s > 0.0)
+        # Others of a part may be low by noise; of one of which most has fallen they have, too.
+        lifted = (below if most else surely) & (self._below_s > 0.0)
         self._below_s = np.where(below, STEPS_S, self._below_s - dt_s)
         return lifted if np.count_nonzero(lifted) else None
 

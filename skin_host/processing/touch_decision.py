@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from skin_host.processing.curves import Curve
 from skin_host.processing.masks import Mask, any_of
-from skin_host.processing.touch import Levels, Residuals, TouchDetector
+from skin_host.processing.residuals import Residuals
+from skin_host.processing.touch import Levels, TouchDetector
 
 Floats = NDArray[np.float32]
 

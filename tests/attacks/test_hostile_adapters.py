@@ -276,6 +276,20 @@ async def test_a_server_of_buses_that_restarts_is_connected_to_again(
     assert bus.counters.removals == 1
 
 
+def test_the_connection_to_a_server_of_buses_fails_if_its_computer_vanishes(
+    served: tuple[Server, Callable[[], Port]],
+) -> None:
+    """Where no packet comes back, not even a refusal, reading would wait for ever."""
+    _, open_it = served
+    connection = vars(open_it()._bus)["_SocketCanDaemonBus__socket"]
+    tcp = socket.IPPROTO_TCP
+    assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+    # What was sent fails after 5 s, and where nothing is sent, probes that begin after 1 s.
+    assert connection.getsockopt(tcp, socket.TCP_USER_TIMEOUT) == 5000
+    assert connection.getsockopt(tcp, socket.TCP_KEEPIDLE) == 1
+    assert connection.getsockopt(tcp, socket.TCP_KEEPINTVL) == 1
+
+
 async def test_a_server_that_does_not_answer_any_more_is_named(
     served: tuple[Server, Callable[[], Port]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from skin_host.config.settings import Drift
 from skin_host.processing.drift import BaselineTracker, paper_step, proportional_step
+from skin_host.processing.loaded_zeros import BULGED
 
 N = 24
 NOBODY = np.zeros(N, bool)
@@ -793,14 +794,17 @@ def stride(track, lifts, relaxed=0.0, missing=NOBODY, noise=0.5, touched=NOBODY)
     track.step(units, touched, missing, 1.0, relaxed, lowest=(lowest, np.full(N, noise)))
 
 
-@pytest.mark.parametrize(("lifted", "followed"), [(N // 2 + 1, True), (N // 2, False)])
-def test_a_load_in_the_zeros_of_most_of_a_part_is_known_after_two_steps(lifted, followed):
+@pytest.mark.parametrize(
+    ("lifted", "touched", "followed"),
+    [(N // 2 + 1, 1, True), (N // 2, 1, False), (BULGED + 1, 0, True), (BULGED, 0, False)],
+)
+def test_a_load_in_the_zeros_of_much_of_a_part_is_known_after_two_steps(lifted, touched, followed):
     """Nothing else is below zero so widely; a bulge is beside a touch."""
     track = tracker()
-    lifts = np.arange(N) < lifted
-    stride(track, lifts)
+    lifts, presses = np.arange(N) < lifted, np.arange(N) >= N - touched
+    stride(track, lifts, touched=presses)
     assert track.baseline[:lifted].min() > -4.0
-    stride(track, lifts)
+    stride(track, lifts, touched=presses)
     assert bool(track.baseline[0] == pytest.approx(-7.0, abs=0.1)) == followed
     assert np.abs(track.baseline[lifted:]).max() < 0.5
 

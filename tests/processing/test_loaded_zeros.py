@@ -55,3 +55,19 @@ def test_bulges_reach_down_to_a_limit(low: float, lifted: bool) -> None:
     steps = [zeros.lifted(np.full(4, low), 0.0, NONE, ALL, 1.0) for _ in range(2)]
     assert steps[0] is None
     assert (steps[1] is not None) == lifted
+
+
+@pytest.mark.parametrize(
+    ("low", "touched", "lifted"),
+    [(21, 0, True), (20, 0, False), (41, 1, True), (40, 1, False), (41, 5, False), (51, 5, True)],
+)
+def test_a_quarter_of_a_part_bulges_only_beside_what_touches_it(
+    low: int, touched: int, lifted: bool
+) -> None:
+    n = 80
+    zeros = LoadedZeros(n)
+    readings = np.where(np.arange(n) < low, -6.0, 0.0)
+    presses, received = np.arange(n) >= n - touched, np.ones(n, np.bool_)
+    steps = [zeros.lifted(readings, 0.5, presses, received, 1.0) for _ in range(2)]
+    assert steps[0] is None
+    assert (steps[1] is not None) == lifted

@@ -102,9 +102,9 @@ MUTANTS = [
     ),
     Mutant(
         "halves are paired across a pause",
-        "bus/assembler.py",
-        "        return min(paused_ns, first_ns + state.close_ns)",
-        "        return first_ns + 1000 * state.pause_ns",
+        "bus/periods.py",
+        "        return min(paused_ns, first_ns + self.close_ns)",
+        "        return first_ns + 1000 * self.pause_ns",
     ),
     Mutant(
         "a board is never silent",
