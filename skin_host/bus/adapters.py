@@ -46,6 +46,8 @@ LONGEST_LINE = 4096
 #: Clocks that differ by less are the same. Within so long some frame is read at once.
 SAME_S = 0.002
 FRESH_S = 2.0
+#: Frames that come from a queue that has not been empty for longer than this have waited.
+BACKLOG_S = 0.1
 #: Opening may take so long: a serial adapter takes 2 s. Closing is waited for this long.
 OPEN_S = 5.0
 CLOSE_S = 1.0
@@ -110,6 +112,7 @@ class Stamps:
     They differ by what the freshest frame of some seconds seems to have waited. A clock that
     differs by a tenth of a period would make whole sweeps look cut, or boards as if they had
     sent in the future. A single stamp that is ahead may be damaged: two in a row show the clock.
+    Frames that waited because this computer is too busy to read them in time show nothing of it.
     """
 
     def __init__(self) -> None:
@@ -117,6 +120,11 @@ class Stamps:
         self._before_s = math.inf
         self._since_s = -math.inf
         self._least_s = math.inf
+        self._emptied_s = math.inf
+
+    def note_empty(self, now_s: float) -> None:
+        """No more frames wait to be read."""
+        self._emptied_s = now_s
 
     def here(self, stamp_s: float, now_s: float) -> float:
         """Return the time on this computer's clock of a frame that is read now."""
@@ -125,10 +133,11 @@ class Stamps:
         differs_s = now_s - stamp_s
         before_s, self._before_s = self._before_s, differs_s
         waited_s = differs_s - self._behind_s
-        self._least_s = min(self._least_s, waited_s)
+        if now_s - self._emptied_s <= BACKLOG_S:
+            self._least_s = min(self._least_s, waited_s)
         if not 0 <= now_s - self._since_s < FRESH_S:
             # Frames that waited while this computer was busy come after fresh ones.
-            if self._least_s > SAME_S:
+            if SAME_S < self._least_s < math.inf:
                 self._behind_s += self._least_s
                 waited_s -= self._least_s
             self._since_s, self._least_s = now_s, math.inf
@@ -181,6 +190,7 @@ class AdapterPort(Port):
                 for _ in range(CAPACITY):
                     message = self._receive(self._bus)
                     if message is None:
+                        self._stamps.note_empty(self._clock.now_ns() * 1e-9)
                         break
                     if self._put(n, message):
                         errors |= bool(message.is_error_frame)

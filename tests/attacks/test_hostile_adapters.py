@@ -400,6 +400,19 @@ def test_stamps_follow_a_clock_that_runs_slowly_and_keep_what_waited() -> None:
         assert abs(stamp_s - sent_s) < 0.02
 
 
+def test_what_waits_while_the_computer_is_too_busy_for_seconds_keeps_its_stamps() -> None:
+    """Then no frame is read at once for longer than a clock is judged by."""
+    stamps = Stamps()
+    sent_s = now_s = 1_700_000_000.0
+    for number in range(400):
+        sent_s += 0.05
+        # It needs longer for a frame than the next takes to come, and then catches up.
+        now_s = max(sent_s, now_s + (0.09 if 40 <= number < 240 else 0.01))
+        assert stamps.here(sent_s - 300.0, now_s) == pytest.approx(sent_s, abs=1e-5)
+        if now_s == sent_s:
+            stamps.note_empty(now_s)
+
+
 @pytest.mark.parametrize("wrong_s", [3000.0, 40.0, 0.3])
 def test_one_stamp_that_is_ahead_does_not_move_those_after_it(wrong_s: float) -> None:
     """Frames of the next four seconds seemed to be as old as it was ahead."""
