@@ -171,6 +171,8 @@ def hangups_raise() -> Iterator[None]:
     def hang_up(number: int, _: object) -> None:
         raise HangupError
 
+    # What ran before in this process may have left them blocked, as a service that starts does.
+    mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})
     over = threading.Event()
     thread = threading.Thread(target=over.wait)
     thread.start()
@@ -179,6 +181,7 @@ def hangups_raise() -> Iterator[None]:
     signal.signal(signal.SIGHUP, before)
     over.set()
     thread.join()
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 class StartsAsAsked(multiprocessing.get_context("spawn").Process):
