@@ -165,23 +165,32 @@ class HangupError(Exception):
 
 
 @pytest.fixture
-def hangups_raise() -> Iterator[None]:
+def hangups_are_ignored() -> Iterator[None]:
+    """What ran before in this process may have left them blocked, as a service that starts does,
+    and one may wait since then.
+    """
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})
+    yield
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.fixture
+def hangups_raise(hangups_are_ignored: None) -> Iterator[None]:
     """A thread takes them that does not block them, as those of numpy do not."""
 
     def hang_up(number: int, _: object) -> None:
         raise HangupError
 
-    # What ran before in this process may have left them blocked, as a service that starts does.
-    mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})
     over = threading.Event()
     thread = threading.Thread(target=over.wait)
     thread.start()
-    before = signal.signal(signal.SIGHUP, hang_up)
+    signal.signal(signal.SIGHUP, hang_up)
     yield
-    signal.signal(signal.SIGHUP, before)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     over.set()
     thread.join()
-    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 class StartsAsAsked(multiprocessing.get_context("spawn").Process):
@@ -191,6 +200,16 @@ class StartsAsAsked(multiprocessing.get_context("spawn").Process):
         os.kill(os.getpid(), signal.SIGHUP)
         time.sleep(0.05)
         super().start()
+
+
+@pytest.mark.usefixtures("hangups_raise")
+def test_a_signal_that_another_thread_takes_waits_until_a_program_has_started() -> None:
+    is_started = False
+    with pytest.raises(HangupError), kept_from_children(signal.SIGHUP):
+        os.kill(os.getpid(), signal.SIGHUP)
+        time.sleep(0.05)
+        is_started = True
+    assert is_started
 
 
 @pytest.mark.usefixtures("hangups_raise")
@@ -206,11 +225,8 @@ def test_processes_that_are_being_started_as_a_terminal_is_closed_end_without_a_
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.usefixtures("hangups_are_ignored")
 def test_a_signal_that_is_ignored_is_still_ignored_after_a_start() -> None:
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with kept_from_children(signal.SIGHUP):
-            os.kill(os.getpid(), signal.SIGHUP)
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
+    with kept_from_children(signal.SIGHUP):
+        os.kill(os.getpid(), signal.SIGHUP)
+    assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
