@@ -243,6 +243,22 @@ def test_a_status_word_comes_without_the_other_half_of_its_triangle() -> None:
     assert not sweep.raw[[0, 1, 3]].any()
 
 
+@pytest.mark.parametrize("dlc", [6, 7])
+def test_frames_of_old_firmware_without_status_make_whole_sweeps(dlc: int) -> None:
+    assembler = make()
+    for number in range(1, 4):
+        raw = values(4, number)
+        sent = [
+            (can_id, data[:dlc] if data[0] == wire.HEADER_B else data, t_ns)
+            for can_id, data, t_ns in frames(raw, number * PERIOD)
+        ]
+        (sweep,) = feed(assembler, sent)
+        np.testing.assert_array_equal(sweep.raw[:4], raw)
+        assert sweep.present == 0b1111
+        assert not sweep.status.any()
+    assert assembler.counters.incomplete == 0
+
+
 #: All A and then all B, or the reverse.
 @pytest.mark.parametrize("order", [[0, 2, 4, 6, 1, 3, 5, 7], [1, 3, 5, 7, 0, 2, 4, 6]])
 @pytest.mark.parametrize("cut", [1, 3, 6])

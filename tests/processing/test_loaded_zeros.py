@@ -28,6 +28,25 @@ def test_what_fell_less_far_than_a_load_lifts_is_in_no_doubt_when_it_returns(
     assert np.array_equal(zeros.returned, ALL if returned else NONE)
 
 
+def test_what_returns_is_where_its_baseline_was() -> None:
+    zeros = LoadedZeros(4)
+    zeros.expect_back(ALL, np.full(4, 3.0))
+    for level, returned in ((-3.0, False), (3.0, True)):
+        zeros.note_returns(np.full(4, level), np.full(4, -4.0), ALL, NONE, 1.0)
+        assert np.array_equal(zeros.returned, ALL if returned else NONE)
+
+
+@pytest.mark.parametrize(("windows", "lifted"), [(12, True), (13, False)])
+def test_two_lifts_are_of_one_load_within_some_seconds(windows: int, lifted: bool) -> None:
+    """In windows of 0.4 s, the first of which has ended when it is counted."""
+    zeros = LoadedZeros(4)
+    below, rest = np.full(4, -6.0), np.zeros(4)
+    assert zeros.lifted(below, 0.0, NONE, ALL, 0.4) is None
+    for _ in range(windows):
+        assert zeros.lifted(rest, 0.0, NONE, ALL, 0.4) is None
+    assert (zeros.lifted(below, 0.0, NONE, ALL, 0.4) is not None) == lifted
+
+
 @pytest.mark.parametrize(("seconds", "returned"), [(MEMORY_S - 2.0, True), (MEMORY_S, False)])
 def test_what_returns_after_an_hour_is_a_touch(seconds: float, returned: bool) -> None:
     zeros = fallen(7.0, seconds)
