@@ -8,7 +8,17 @@ from hypothesis import strategies as st
 from skin_host.bus import wire
 from skin_host.bus.assembler import PATIENCE_SWEEPS
 from skin_host.bus.wire import FrameBatch
-from tests.support.sweeps import MS, PERIOD, feed, feed_in_parts, frames, learnt, make, values
+from tests.support.sweeps import (
+    MS,
+    PERIOD,
+    feed,
+    feed_in_parts,
+    frames,
+    has_nothing_else,
+    learnt,
+    make,
+    values,
+)
 
 
 def test_a_whole_sweep_is_handed_on_with_its_last_frame():
@@ -92,10 +102,7 @@ def test_a_frame_that_is_late_by_most_of_a_period_joins_no_other_sweep(
     sweeps += assembler.flush()
     whole = []
     for sweep in sweeps:
-        raw = values(4, sweep.t_ns // PERIOD)
-        for triangle in range(4):
-            if sweep.present >> triangle & 1:
-                np.testing.assert_array_equal(sweep.raw[triangle], raw[triangle])
+        has_nothing_else(sweep, values(4, sweep.t_ns // PERIOD))
         whole += [sweep.t_ns // PERIOD] if sweep.present == 0b1111 else []
     assert whole == [number for number in numbers if number <= 4 or not number % 2]
     counters = assembler.counters
@@ -128,9 +135,7 @@ def test_a_late_frame_joins_no_sweep_of_which_the_first_frame_is_late_or_lost(
     sweeps += assembler.flush()
     for sweep in sweeps:
         number = sweep.t_ns // PERIOD
-        for triangle in range(4):
-            if sweep.present >> triangle & 1:
-                np.testing.assert_array_equal(sweep.raw[triangle], values(4, number)[triangle])
+        has_nothing_else(sweep, values(4, number))
         cut = {0: 0b1011, 1: 0b1110}.get(number % 4, 0b1111) if number > 5 else 0b1111
         assert sweep.present == cut
     assert len(sweeps) == 59
@@ -221,10 +226,7 @@ def test_a_sweep_whose_first_stamp_is_ahead_ends_in_time_however_it_is_read(
     sweeps = feed_in_parts(assembler, sent, at_once)
     sweeps += assembler.flush()
     for sweep in sweeps:
-        number = sweep.t_ns // PERIOD
-        for triangle in range(4):
-            if sweep.present >> triangle & 1:
-                np.testing.assert_array_equal(sweep.raw[triangle], values(4, number)[triangle])
+        has_nothing_else(sweep, values(4, sweep.t_ns // PERIOD))
     whole = 0b1111 & ~(1 << lost // 2)
     after = [0b1111 >> (lost + 1) // 2 << (lost + 1) // 2] if lost < 7 else []
     assert [sweep.present for sweep in sweeps] == [whole, *after]

@@ -79,6 +79,13 @@ def feed_in_parts(
     ]
 
 
+def has_nothing_else(sweep: Sweep, raw: np.ndarray) -> None:
+    """Assert that the triangles of a sweep that are present are those that were sent in it."""
+    for triangle, sent in enumerate(raw):
+        if sweep.present >> triangle & 1:
+            np.testing.assert_array_equal(sweep.raw[triangle], sent)
+
+
 def learnt(triangles: str, n: int, order: list[int] | None = None) -> Assembler:
     """An assembler that knows the order of a board's frames."""
     assembler = make(triangles)
