@@ -247,6 +247,10 @@ class Daemon:
                 )
             self.engine.use(found, boards)
             use_measurements(self._contacts, self.engine)
+            stuck = self.engine.stuck() & measured
+            for index, contact in self._contacts.items():
+                part = self.layout.parts[index]
+                contact.stop_waiting(stuck[part.start : part.stop])
             # The other boards keep their zeros.
             former = known if boards is not None else None
             await self.keeper.keep_calibration(measured, former, doubted)

@@ -121,6 +121,12 @@ class PartContact:
         np.copyto(self._lost, self._decides, where=taxels)
         self._is_unsure = True
 
+    def stop_waiting(self, taxels: NDArray[np.bool_]) -> None:
+        """The skin was calibrated at rest while these taxels [m] were stuck: they will not show
+        that nothing touches them.
+        """
+        self._lost[taxels] = 0.0
+
     def use(self, decides: NDArray[np.int64]) -> None:
         """A calibration has found how many measurements int[m] each taxel takes for a decision; 0:
         it is not usable, and will not be valid again.

@@ -284,6 +284,8 @@ class BoardZeros:
         if silent_zero is not None and silent_zero.at_start and silent_zero.was_zeroed:
             self._judge_again(board)
         self._awaited.discard(board)
+        # A pad that the new zero brings back did not jump.
+        self._below.pop(board, None)
         self._releasing.add(board)
         self._on_rezero(board, believed)
         before = self.rezeros.get(board)

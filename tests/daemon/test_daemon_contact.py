@@ -84,6 +84,43 @@ async def test_a_part_that_is_enabled_again_may_be_touched_where_it_failed_meanw
         assert said[-1] == "OFF"
 
 
+@stepped
+async def test_a_pad_that_stuck_in_a_touch_keeps_its_part_unknown_until_a_calibration(
+    clock: SteppedClock, tmp_path: Path
+) -> None:
+    """Nobody can see it released, and a calibration at rest has nothing new of it either."""
+    press = Probe(
+        part="left_hand",
+        at=Place(triangle=4),
+        diameter_mm=10,
+        pressure_kpa=[(0, 0), (0.1, 60), (4, 60), (4.1, 0), (1000, 0)],
+        start_s=8.0,
+    )
+    bus, scene = Bus(interface="virtual", channel="stuck"), Scene(quiet=True, probe=[press])
+    async with living(bus, tmp_path, scene=scene, clock=clock) as live:
+        daemon = live.daemon
+        await live.until_well(but=frozenset({"board_rezeroed"}))
+        states: list[str] = []
+
+        def note(part: str, state: ContactState) -> None:
+            if part == "left_hand":
+                states.append(state)
+
+        daemon.publisher.put_contact = note  # type: ignore[method-assign]
+        zeros, board = daemon.engine.zeros, daemon.layout.boards[0]
+        await live.wait(lambda: bool(zeros.felt.any()))
+        taxel = int(np.flatnonzero(zeros.felt)[0])
+        triangle, pad = np.argwhere(board.taxel_index == taxel)[0].tolist()
+        live.robot.inject(Fault(name="stuck_taxel", board="hand", triangle=triangle, taxel=pad))
+        await live.wait(lambda: bool(daemon.engine.stuck()[taxel]))
+        await clock.sleep(60.0)
+        assert states[-1] == "UNKNOWN"
+        await daemon.calibrate(5.0)
+        assert daemon.engine.stuck()[taxel]
+        await clock.sleep(5.0)
+        assert states[-1] == "OFF"
+
+
 async def test_after_a_restart_a_silent_board_is_unknown_whatever_the_broker_kept(
     can_bus_settings: Bus, tmp_path: Path, mosquitto: Mosquitto
 ) -> None:

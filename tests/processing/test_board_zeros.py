@@ -131,6 +131,15 @@ def test_a_pad_that_comes_back_at_once_jumps(hand: Hand, sweeps: int) -> None:
     assert hand.in_doubt == []
 
 
+def test_a_pad_that_a_new_zero_brings_back_does_not_jump(hand: Hand) -> None:
+    """Its board is set up just after it has lifted; another pad was pressed then."""
+    hand.send(3, p3=FAR_BELOW)
+    hand.engine.zeros.rezero(0)
+    hand.send(20)
+    hand.send(1, p4=FAR_BELOW)
+    assert hand.in_doubt == [4]
+
+
 @pytest.mark.parametrize(("below", "doubted"), [(4, []), (5, [3])])
 def test_whether_a_pad_stays_below_zero_shows_in_the_sweeps_that_came(
     hand: Hand, below: int, doubted: list[int]
