@@ -64,7 +64,7 @@ LAST_LINES = 30
 # A slow machine is no failure.
 hypothesis.settings.register_profile("project", deadline=None, max_examples=40)
 # `make test-system` looks further: --hypothesis-profile=far.
-hypothesis.settings.register_profile("far", deadline=None, max_examples=200)
+hypothesis.settings.register_profile("far", deadline=None, max_examples=120)
 # support/mutation.py: the same few examples in every run, and none is made smaller.
 hypothesis.settings.register_profile(
     "mutation",
