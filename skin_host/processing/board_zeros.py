@@ -284,8 +284,6 @@ class BoardZeros:
         if silent_zero is not None and silent_zero.at_start and silent_zero.was_zeroed:
             self._judge_again(board)
         self._awaited.discard(board)
-        # A pad that the new zero brings back did not jump.
-        self._below.pop(board, None)
         self._releasing.add(board)
         self._on_rezero(board, believed)
         before = self.rezeros.get(board)
@@ -645,12 +643,16 @@ class BoardZeros:
         answered = (self._ledger.error[row] == 0) & self._ledger.present[row]
         below = below_zero(sweep.raw, self._ledger.far[row] & answered[:, None])
         before = self._below.pop(sweep.board, None)
+        rezero = self.rezeros.get(sweep.board)
+        if rezero is not None and not rezero.begun:
+            # What another zero brings back did not jump.
+            before = None
         no_load = float(self._layout.boards[sweep.board].settings.no_load)
         if before is not None:
             back = (before > 0) & (before < BELOW_SWEEPS) & answered[:, None]
-            if sweep.board in self.rezeros:
+            if rezero is not None:
                 # What is known to have been pressed comes back when it is pressed again.
-                back &= ~self.rezeros[sweep.board].unknown.reshape(TRIANGLES, PADS)
+                back &= ~rezero.unknown.reshape(TRIANGLES, PADS)
             if any_of(back & (sweep.raw < (no_load + 255) / 2)):
                 # What was pressed and lifts stays below zero; what a bad wire brings does not.
                 self._jumped_ns[sweep.board] = sweep.t_ns

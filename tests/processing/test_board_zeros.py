@@ -135,7 +135,10 @@ def test_a_pad_that_a_new_zero_brings_back_does_not_jump(hand: Hand) -> None:
     """Its board is set up just after it has lifted; another pad was pressed then."""
     hand.send(3, p3=FAR_BELOW)
     hand.engine.zeros.rezero(0)
+    # What was received last is of the former zero.
+    assert hand.in_doubt == [3]
     hand.send(20)
+    assert hand.in_doubt == []
     hand.send(1, p4=FAR_BELOW)
     assert hand.in_doubt == [4]
 
