@@ -14,6 +14,7 @@ import codecs
 import contextlib
 import io
 import logging
+import math
 import re
 from bisect import bisect_left
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -495,9 +496,9 @@ def _frame(message: "can.Message") -> tuple[str, Frame] | None:
         return None
     channel = "" if message.channel is None else str(message.channel)
     data = bytes(message.data)
-    t_ns = nanoseconds(message.timestamp)
     if len(data) > 8:
         raise ValueError(f"a frame of {len(data)} bytes; wanted at most 8")
+    t_ns = nanoseconds(message.timestamp) if math.isfinite(message.timestamp) else -1
     if not 0 <= t_ns < 2**63:
         raise ValueError(f"a time of {message.timestamp:g} s")
     return channel, (identifier(message), data, t_ns)

@@ -23,7 +23,7 @@ from skin_host.cli.common import (
 )
 from skin_host.cli.fits import add_fits, fit
 from skin_host.cli.options import add_rules
-from skin_host.errors import RequestError, visible
+from skin_host.errors import StateError, visible
 from skin_host.files import check_output
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         served_by_daemon(settings, arguments.config.parent, {layout.parts[i].name for i in parts})
     )
     if served is not None:
-        raise RequestError(
+        raise StateError(
             f"a daemon publishes {served} at broker {settings.mqtt.host}:{settings.mqtt.port}: "
             "calibrating beside it "
             "would zero its boards; ask it with `skin command calibrate`, or stop it"

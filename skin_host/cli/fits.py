@@ -226,6 +226,7 @@ def _show_course(
                 "highest_kpa": curves.highest_kpa,
                 "ratio_to_curve": fitted.ratio,
                 "hysteresis_known": fitted.unloads,
+                "hysteresis_kept": fitted.memory_kept,
                 "memory": {
                     "radius_kpa": list(curves.memory.radius_kpa),
                     "weight": list(curves.memory.weight),
@@ -256,7 +257,8 @@ def _show_course(
     )
     print(f"0 to {curves.highest_kpa:.0f} kPa; the table's clock is {curves.lag_s:+.2f} s ahead")
     print(f"{fitted.ratio:.2g} times the pressures of the configured curve")
-    print(f"hysteresis of the foam: {plays or ('none' if fitted.unloads else 'not known')}")
+    whose = f", kept from {path} with curves" if fitted.memory_kept else ""
+    print(f"hysteresis of the foam: {plays or ('none' if fitted.unloads else 'not known')}{whose}")
     print(", ".join(f"{count} {name}" for name, count in counts.items() if count))
     if len(error):
         of = "the good" if fitted.unloads else "the good while loading"

@@ -59,7 +59,7 @@ def add_commands(commands: Commands) -> None:
     status = add_command(
         commands,
         "status",
-        "show how every part is; exit status 1 unless all is well",
+        "show how every part is; exit status 1 unless each is ok or has a warning",
         "skin status --json",
     )
     add_broker(status)

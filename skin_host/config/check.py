@@ -6,6 +6,7 @@ mistakes are listed as warnings, with their path in the file.
 
 import math
 from collections.abc import Sequence
+from ipaddress import ip_address
 from itertools import combinations
 from typing import Any
 
@@ -181,7 +182,20 @@ def _interface_warnings(buses: list[Record]) -> list[str]:
             meant = f"meant {near}?" if near else f"it has {known}"
             where = f"buses.{bus['name']}.interface"
             warnings.append(f'{where}: python-can here has no interface "{seen}"; {meant}')
+        channel = bus["channel"]
+        if seen == "udp_multicast" and not _is_multicast(channel):
+            warnings.append(
+                f'buses.{bus["name"]}.channel: "{channel}" is no multicast address; wanted one '
+                "such as 239.74.163.2"
+            )
     return warnings
+
+
+def _is_multicast(channel: str) -> bool:
+    try:
+        return ip_address(channel).is_multicast
+    except ValueError:
+        return False
 
 
 def _board_warnings(layout: Layout) -> list[str]:

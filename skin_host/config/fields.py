@@ -5,6 +5,7 @@ stays finite and rises with the reading. A value outside of it is a mistake of u
 """
 
 from typing import Annotated
+from urllib.parse import urlsplit
 
 from msgspec import Meta
 
@@ -50,6 +51,20 @@ Address = Annotated[
         )
     ),
 ]
+
+
+def host_and_port(address: str, port: int) -> tuple[str, int]:
+    """Return the host and the port of an `Address`, by default `port`.
+
+    Raises:
+        ValueError: it has a number that no port has, or no IPv6 address in its brackets.
+    """
+    parts = urlsplit(f"//{address}")
+    given = parts.port
+    if given == 0 or parts.hostname is None:
+        raise ValueError("wanted a port from 1 to 65535")
+    return parts.hostname, given or port
+
 
 #: Sizes: of pads, foams, probes, fingertips.
 Millimetres = Annotated[float, Meta(ge=0.001, le=10_000)]

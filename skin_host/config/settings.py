@@ -9,7 +9,7 @@ name the file and the path inside it. `docs/configuration.md` explains every key
 import codecs
 import hashlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import date, datetime, time
 from itertools import groupby
 from pathlib import Path
@@ -40,6 +40,7 @@ from skin_host.config.fields import (
     Printable,
     Seconds,
     Units,
+    host_and_port,
 )
 from skin_host.config.fingertips import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
 from skin_host.config.relaxation import RelaxationSettings, with_file
@@ -250,6 +251,29 @@ class Mqtt(_Table, frozen=True):
         Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/-]+(?!\n)$", max_length=256)] | None
     ) = None
 
+    def wrong_values(self) -> Iterator[tuple[str, str]]:
+        """Values that contradict each other: the key, and the reason."""
+        if self.password_file is not None and self.username is None:
+            yield "password_file", "needs mqtt.username too"
+        for key in ("ca_file", "certificate_file", "key_file"):
+            if getattr(self, key) is not None and not self.tls:
+                yield key, "is given, but mqtt.tls is not true"
+        if self.key_file is not None and self.certificate_file is None:
+            yield "key_file", "needs mqtt.certificate_file too"
+        ends: set[tuple[str, int]] = set()
+        for i, address in enumerate(self.brokers):
+            try:
+                end = host_and_port(address, self.port)
+            except ValueError as error:
+                yield f"brokers[{i}]", f"{address}: {error}"
+                continue
+            if end in ends:
+                yield f"brokers[{i}]", f"{address} is named twice"
+            ends.add(end)
+        if len(self.brokers) > 1 and self.protocol != "5":
+            what = 'need mqtt.protocol = "5", by which subscribers distinguish new messages from'
+            yield "brokers", f"{len(self.brokers)} brokers {what} old ones"
+
 
 class Receive(_Table, frozen=True):
     """The receive path, see docs/receive.md."""
@@ -410,6 +434,8 @@ def _check_references(path: Path, settings: Settings) -> None:
     if 0.0 < settings.mqtt.frame_hz < LEAST_HZ:
         seen = f"seen {settings.mqtt.frame_hz:g}, wanted 0 or at least {LEAST_HZ:g}"
         raise wrong("mqtt.frame_hz", seen)
+    for key, what in settings.mqtt.wrong_values():
+        raise wrong(f"mqtt.{key}", what)
     addresses: dict[tuple[str, int], str] = {}
     boards: list[tuple[str, str, Board | Fingertip]] = [
         *((f"boards.{name}", f'board "{name}"', board) for name, board in settings.boards.items()),

@@ -47,6 +47,8 @@ FRAME_NS = 125_000
 #: Bounds of what is read: an hour of sweeps, no pressure beyond 10 MPa.
 LONGEST_SWEEPS = 200_000
 HIGHEST_KPA = 10_000.0
+#: Its zero is taken from so much of a recording.
+ZERO_S = 5.0
 #: One batch of frames holds this many sweeps.
 SWEEPS_PER_BATCH = 8
 #: By then the emulated boards stream.
@@ -133,8 +135,12 @@ def read(path: Path) -> InsoleRecording:
             t_s, counts, pressure = (arrays[n] for n in ("t_s", "counts", "pressure_kpa"))
     except (OSError, ValueError, KeyError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise LogError(f"{path}: {str(error).splitlines()[0]}; {wanted}") from None
-    seen = f"t_s {t_s.shape}, counts {counts.dtype} {counts.shape}, pressure_kpa {pressure.shape}"
+    seen = (
+        f"t_s {t_s.dtype} {t_s.shape}, counts {counts.dtype} {counts.shape}, "
+        f"pressure_kpa {pressure.dtype} {pressure.shape}"
+    )
     fits = counts.dtype == np.uint8 and counts.shape == (*t_s.shape, PADS) and pressure.ndim == 1
+    fits &= t_s.dtype.kind in "iuf" and pressure.dtype.kind in "iuf"
     if not fits or not 0 < len(t_s) <= LONGEST_SWEEPS or not 0 < len(pressure) <= LONGEST_SWEEPS:
         raise LogError(f"{path}: {seen}; {wanted}, at most {LONGEST_SWEEPS} sweeps")
     t_s, pressure = t_s.astype(np.float64), pressure.astype(np.float64)
@@ -143,6 +149,11 @@ def read(path: Path) -> InsoleRecording:
     if not (np.isfinite(pressure).all() and abs(pressure).max() < HIGHEST_KPA):
         raise LogError(f"{path}: pressure_kpa is not finite or above {HIGHEST_KPA:g} kPa")
     t_ns = START_NS + np.rint(t_s * 1e6).astype(np.int64) * 1000
+    if t_ns[-1] - t_ns[0] < ZERO_S * 1e9 or not np.diff(t_ns).all():
+        raise LogError(
+            f"{path}: {len(t_s)} sweeps in {t_s[-1] - t_s[0]:.3g} s; wanted at least {ZERO_S:g} s "
+            "of untouched skin, and sweeps that are microseconds apart"
+        )
     return InsoleRecording(path.stem, t_ns, counts, pressure)
 
 

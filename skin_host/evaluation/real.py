@@ -22,7 +22,7 @@ from skin_host.errors import RequestError
 from skin_host.evaluation import insole, page, tables
 from skin_host.evaluation.document import as_text, write
 from skin_host.evaluation.goals import goal
-from skin_host.evaluation.insole import InsoleRecording
+from skin_host.evaluation.insole import ZERO_S, InsoleRecording
 from skin_host.evaluation.machine import machine
 from skin_host.evaluation.steps import show_step
 from skin_host.layout import Layout, build_layout
@@ -30,7 +30,7 @@ from skin_host.processes import Processes
 from skin_host.processing.calibration import Calibration, Verdict, with_pressures_of
 from skin_host.processing.core import Engine
 from skin_host.recording.fitting import Samples, fit_curves
-from skin_host.recording.load_table import LoadTable
+from skin_host.recording.load_table import LoadTable, check_course, check_covers
 from skin_host.recording.replay import calibrate_from_log, steps
 from skin_host.recording.turns import fed
 
@@ -44,7 +44,6 @@ RECORDINGS = Path("../shared/data/insole")
 GRASPS = "icub_grasp.log"
 #: A recording is calibrated on the one of its foam: the first word of its name, and this.
 CALIBRATION = "_calibration"
-ZERO_S = 5.0
 #: Nothing is pressed for so long: a touch in it is false.
 UNTOUCHED_S = 10.0
 #: Pads that move at all and never read less than this in the first seconds are alive.
@@ -292,6 +291,12 @@ def fit_pressures(path: Path) -> Calibration:
         RequestError: nothing is pressed in it, or its pressure is of another recording.
     """
     recording = insole.read(path)
+    n = min(len(recording.t_ns), len(recording.pressure_kpa))
+    time_s: Floats = recording.t_ns[:n].astype(np.float64) * 1e-9
+    load = LoadTable(path, time_s, recording.pressure_kpa[:n])
+    # Without gaps there are about as many samples as sweeps.
+    check_course(load)
+    check_covers(load, recording.t_ns[0] * 1e-9, recording.t_ns[-1] * 1e-9, "recording")
     settings, layout = insole.skin()
     calibration = calibrate(recording, settings, layout)
     period_ns = int(np.median(np.diff(recording.t_ns)))
@@ -309,9 +314,6 @@ def fit_pressures(path: Path) -> Calibration:
         calibration,
         ZERO_S,
     )
-    n = min(len(recording.t_ns), len(recording.pressure_kpa))
-    time_s: Floats = recording.t_ns[:n].astype(np.float64) * 1e-9
-    load = LoadTable(path, time_s, recording.pressure_kpa[:n])
     return fit_curves(samples, settings, layout, load).calibration
 
 
@@ -432,9 +434,9 @@ def pressure_errors(
         )
     )
     row["why_no_pressure"] = why_not
-    if why_not is not None or not course.valid[:, usable].any():
-        return row
     paired = course.sweep < len(recording.pressure_kpa)
+    if why_not is not None or not course.valid[paired][:, usable].any():
+        return row
     valid = course.valid[paired][:, usable]
     kpa = course.pressure_kpa[paired][:, usable].astype(np.float64)
     row["valid_share"] = float(np.mean(valid))

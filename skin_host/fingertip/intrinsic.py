@@ -15,6 +15,10 @@ Floats = NDArray[np.float64]
 
 _NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
 
+#: A push has at least this share of its force into the surface: no friction carries a thousand
+#: times as much along it, and the less it has, the less its line determines where it enters.
+LEAST_SLOPE = 1e-3
+
 
 class ContactVerdict(IntEnum):
     """Result of locating one sample of force and torque."""
@@ -158,12 +162,13 @@ def locate(
     pitch = (direction * torque / safe).sum(axis=1)
     distance, found = surface.enter(arm, direction)
     point = arm + distance[:, None] * direction
+    normal = surface.normal(point)
+    found &= (direction * normal).sum(axis=1) <= -LEAST_SLOPE
     verdict = np.full(len(force), ContactVerdict.CONTACT, np.uint8)
     verdict[np.abs(pitch) > pitch_limit_mm] = ContactVerdict.SEVERAL_CONTACTS
     verdict[~found] = ContactVerdict.NO_SINGLE_CONTACT
     verdict[~heavy] = ContactVerdict.TOO_LIGHT
     point[verdict != ContactVerdict.CONTACT] = np.nan
-    normal = surface.normal(point)
     normal[verdict != ContactVerdict.CONTACT] = np.nan
     into = -(force * normal).sum(axis=1)
     return IntrinsicContact(

@@ -276,8 +276,16 @@ def _unit(
     rows: Floats = table.rows[index].copy()
     line = table.lines[int(index[0])]
     label = f'triangle {slots[0] % TRIANGLES_PER_BOARD} of board "{patch.board}"'
-    placed = rows[:, :3].any(axis=1)
-    measured = placed & _own_places(table, index, rows)
+    placed = _placed(rows)
+    measured = _own_places(table, index, rows)
+    if measured is not None and not measured.any():
+        findings.odd(
+            (table.file, line),
+            f"{label}: by taxel2Repr none of its places is its own; those that differ are taken",
+        )
+        measured = None
+    if measured is None:
+        measured = _single_places(rows)
     normal = rows[placed, 3:].mean(axis=0)
     longest = np.linalg.norm(rows[placed, 3:], axis=1).max()
     if np.linalg.norm(normal) <= CANCELLED * longest:
@@ -308,23 +316,37 @@ def _unit(
     return rows
 
 
-def _own_places(table: Table, index: NDArray[np.intp], rows: Floats) -> NDArray[np.bool_]:
-    """Return which rows hold a measured position, not a copy of the representative's position."""
-    if table.represented_by is not None:
-        by = table.represented_by[index]
-        valid = (by >= 0) & (by < len(table.rows))
-        source = np.where(valid, by, index)
-        copied = (table.rows[source, :3] == rows[:, :3]).all(axis=1) & (source != index)
-        own: NDArray[np.bool_] = ~copied & valid
-        return own
+def _own_places(table: Table, index: NDArray[np.intp], rows: Floats) -> NDArray[np.bool_] | None:
+    """Return which rows hold a place that is not a copy of their representative's; None if the file
+    does not have these.
+    """
+    if table.represented_by is None:
+        return None
+    by = table.represented_by[index]
+    valid = (by >= 0) & (by < len(table.rows))
+    source = np.where(valid, by, index)
+    copied = (table.rows[source, :3] == rows[:, :3]).all(axis=1) & (source != index)
+    own = _placed(rows)
+    own[copied | ~valid] = False
+    return own
+
+
+def _single_places(rows: Floats) -> NDArray[np.bool_]:
+    """Return which rows hold a place that no other row has; if none does, one of each place."""
     _, first, place, copies = np.unique(
         rows[:, :3], axis=0, return_index=True, return_inverse=True, return_counts=True
     )
+    single, placed = _placed(rows), _placed(rows)
     # When several taxels share one position, it is unknown which of them was measured.
-    own = copies[place] == 1
-    if not own.any():
-        own[first] = True
-    return own
+    single[copies[place] > 1] = False
+    if not single.any():
+        single[first] = placed[first]
+    return single
+
+
+def _placed(rows: Floats) -> NDArray[np.bool_]:
+    """Return which rows have a place: without a taxel there are zeros."""
+    return np.asarray(rows[:, :3].any(axis=1))
 
 
 def _pressure(kind: KindSettings) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 from urllib.parse import SplitResult, unquote, urlsplit
 
+from skin_host.config.fields import host_and_port
 from skin_host.errors import BusyFileError, ConfigurationError, RequestError
 from skin_host.files import read_whole
 
@@ -68,6 +69,8 @@ class Broker:
             CredentialError: the password cannot be read.
             ConfigurationError: one of them cannot be used.
         """
+        for key, what in settings.wrong_values():
+            raise ConfigurationError(f"mqtt.{key}: {what}")
         return cls(
             settings.host,
             settings.port,
@@ -93,23 +96,9 @@ class Broker:
         first = cls.from_settings(settings, folder)
         if not settings.brokers:
             return [first]
-        brokers = [first._at(address) for address in settings.brokers]
-        if len({str(broker) for broker in brokers}) < len(brokers):
-            raise ConfigurationError("mqtt.brokers: one of them is named twice")
-        if len(brokers) > 1 and not first.v5:
-            raise ConfigurationError(
-                f'mqtt.brokers: {len(brokers)} brokers need mqtt.protocol = "5", by which '
-                "subscribers distinguish new messages from old ones"
-            )
+        ends = [host_and_port(address, settings.port) for address in settings.brokers]
+        brokers = [replace(first, host=host, port=port) for host, port in ends]
         return sorted(brokers, key=lambda one: sha256(f"{name}|{one}".encode()).digest())
-
-    def _at(self, address: str) -> "Broker":
-        try:
-            parts = urlsplit(f"//{address}")
-            port = parts.port or self.port
-        except ValueError as error:
-            raise ConfigurationError(f'mqtt.brokers: "{address}": {error}') from None
-        return replace(self, host=parts.hostname or self.host, port=port)
 
     @classmethod
     def from_url(cls, url: str, protocol: Literal["5", "3.1.1"] = "5") -> tuple["Broker", str]:
@@ -178,8 +167,6 @@ def _from_environment(parts: SplitResult) -> str | None:
 
 def _password(settings: "Mqtt", folder: Path) -> str | None:
     if settings.password_file is not None:
-        if settings.username is None:
-            raise ConfigurationError("mqtt.password_file: needs mqtt.username too")
         path = folder / settings.password_file
     else:
         credentials = os.environ.get("CREDENTIALS_DIRECTORY")
@@ -222,12 +209,7 @@ def _tls(settings: "Mqtt", folder: Path) -> ssl.SSLContext | None:
         "key_file": settings.key_file,
     }
     if not settings.tls:
-        for key, name in files.items():
-            if name is not None:
-                raise ConfigurationError(f"mqtt.{key}: is given, but mqtt.tls is not true")
         return None
-    if settings.key_file is not None and settings.certificate_file is None:
-        raise ConfigurationError("mqtt.key_file: needs mqtt.certificate_file too")
     for key, name in files.items():
         if name is None:
             continue

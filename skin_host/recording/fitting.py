@@ -6,11 +6,11 @@ gains are those of the boards that were pressed in it: limbs are fitted one afte
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from skin_host.config.relaxation import RELAXATION_SCHEMA
 from skin_host.config.settings import Settings
 from skin_host.errors import LogError, RequestError
 from skin_host.files import write_document
-from skin_host.layout import Layout, PadKind
+from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration, Verdict, with_curves, with_gains
 from skin_host.processing.core import Engine
@@ -44,6 +44,8 @@ from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model, parameters_of
 from skin_host.recording import seconds as in_seconds
 from skin_host.recording.load_table import (
+    GAP_SAMPLES,
+    LONGEST_GAP_S,
     LoadTable,
     check_course,
     check_covers,
@@ -94,6 +96,22 @@ WANTED = "wanted a recording of one hold, or of levels, without such a step"
 SETTLING_SHARE = 0.3
 
 
+class Gap(NamedTuple):
+    """A time in which nothing of a board was received.
+
+    Attributes:
+        board: its name.
+        taxels: bool[n], what it reads of one part.
+        rows: samples which repeat what was received before; the next is what came after.
+        seconds: how long it lasted.
+    """
+
+    board: str
+    taxels: Mask
+    rows: slice
+    seconds: float
+
+
 @dataclass(frozen=True)
 class Samples:
     """A recording as bytes at equal distances: t samples of the n taxels of the skin.
@@ -107,6 +125,7 @@ class Samples:
         usable: bool[n], usable taxels.
         calibration: of the untouched skin at the beginning.
         zero_s: how long that was.
+        gaps: of the boards that were received, longer than a table of pressure may have them.
     """
 
     dt_s: float
@@ -117,6 +136,7 @@ class Samples:
     usable: Mask
     calibration: Calibration
     zero_s: float
+    gaps: tuple[Gap, ...] = ()
 
     def units(self, rows: slice, taxels: Mask) -> Floats:
         """Activations above the baseline of some samples and taxels."""
@@ -138,6 +158,7 @@ class Fitted(Generic[Found]):
         ratio: known pressures over those of the common curve, of the median pad.
         unshown: bool[n], those of them of which the recording does not show a curve.
         unloads: whether the foam's hysteresis is known, by this recording or before it.
+        memory_kept: whether it is the one before, because pads keep their curves.
     """
 
     calibration: Calibration
@@ -146,6 +167,7 @@ class Fitted(Generic[Found]):
     ratio: float
     unshown: Mask
     unloads: bool = True
+    memory_kept: bool = False
 
 
 def read_samples(
@@ -195,17 +217,67 @@ def read_samples(
     grid_ns = np.arange(first_ns, last_ns, step_ns)
     raw = np.zeros((len(grid_ns), layout.n_taxels), dtype=np.uint8)
     usable = np.zeros(layout.n_taxels, dtype=np.bool_)
+    gaps: list[Gap] = []
     for part in heard:
         mine = slice(layout.parts[part].start, layout.parts[part].stop)
         valid = np.array(valids[part])
         index = np.searchsorted(times_ns[part], grid_ns, side="right").clip(1) - 1
         raw[:, mine] = _held(np.array(raws[part]), valid)[index]
         usable[mine] = calibration.usable[mine] & (valid.mean(axis=0) > 0.5)
+        gaps += _gaps_of(layout, layout.parts[part], np.array(times_ns[part]), valid, grid_ns)
     zero = layout.no_load - calibration.baseline
     received = ~np.isin(calibration.verdict, (Verdict.ABSENT, Verdict.TOO_FEW))
     return Samples(
-        step_ns * 1e-9, first_ns * 1e-9, raw, zero, received, usable, calibration, seconds
+        step_ns * 1e-9,
+        first_ns * 1e-9,
+        raw,
+        zero,
+        received,
+        usable,
+        calibration,
+        seconds,
+        tuple(gaps),
     )
+
+
+def _gaps_of(
+    layout: Layout,
+    part: PartLayout,
+    times_ns: NDArray[np.int64],
+    valid: Mask,
+    grid_ns: NDArray[np.int64],
+) -> Iterator[Gap]:
+    """Yield the gaps of the boards of a part that were received.
+
+    Args:
+        layout: of the skin.
+        part: one of it.
+        times_ns: int64[f], of its frames.
+        valid: bool[f, k], its taxels.
+        grid_ns: int64[t], of the samples.
+    """
+    for board, taxels in _boards_of(layout, part):
+        came_ns = times_ns[valid[:, taxels[part.start : part.stop]].any(axis=1)]
+        if len(came_ns) < 2:
+            continue
+        longest_ns = max(LONGEST_GAP_S * 1e9, GAP_SAMPLES * float(np.median(np.diff(came_ns))))
+        # Before its first frame the skin is untouched as it is then.
+        edges_ns = np.concatenate([came_ns, grid_ns[-1:]])
+        for gap in np.flatnonzero(np.diff(edges_ns) > longest_ns).tolist():
+            begin_ns, end_ns = edges_ns[gap : gap + 2].tolist()
+            rows = slice(
+                int(np.searchsorted(grid_ns, begin_ns, side="right")),
+                int(np.searchsorted(grid_ns, end_ns)),
+            )
+            yield Gap(board, taxels, rows, (end_ns - begin_ns) * 1e-9)
+
+
+def _boards_of(layout: Layout, part: PartLayout) -> Iterator[tuple[str, Mask]]:
+    """Yield the boards of a part by name, each with what it reads of this part, bool[n]."""
+    for board in part.boards:
+        mine = layout.taxels_of([board])
+        mine[: part.start] = mine[part.stop :] = False
+        yield layout.boards[board].name, mine
 
 
 def hold_record(
@@ -224,7 +296,8 @@ def hold_record(
 
     Raises:
         RequestError: nothing was pressed for long, or more than once, or it was not released; or
-            the table is no course of pressure in kPa, or does not cover the hold.
+            the table is no course of pressure in kPa, or does not cover the hold; or the press or
+            the release lies in a gap.
     """
     # Some thousand samples show which taxels take part; only for those the whole is used.
     thin = slice(None, None, max(len(samples.raw) // 4000, 1))
@@ -238,6 +311,11 @@ def hold_record(
             "the first seconds untouched"
         )
     momentary = curve.part(chosen).kpa(samples.units(slice(None), chosen)).mean(axis=1)
+    gaps = [gap for gap in samples.gaps if np.any(gap.taxels & chosen)]
+    for gap in gaps:
+        around = momentary[max(gap.rows.start - 1, 0) : gap.rows.stop + 1]
+        if np.ptp(around) > MOVING_SHARE * strongest[chosen].mean():
+            raise _gap_error(gap, samples, "while press and release move the reading")
     held = momentary > 0.5 * strongest[chosen].mean()
     start = int(np.argmax(held))
     release = len(held) - int(np.argmax(held[::-1]))
@@ -267,6 +345,8 @@ def hold_record(
     moving = np.abs(np.diff(momentary)) > MOVING_SHARE * strongest[chosen].mean()
     pressure[:-1][moving] = np.nan
     pressure[1:][moving] = np.nan
+    for gap in gaps:
+        pressure[gap.rows] = np.nan
     record = merge(samples.dt_s, momentary, pressure, start, release)
     held_units = np.median(samples.units(slice(start, release), chosen), axis=0)
     half = 0.5 * np.array([[-1.0], [1.0]])
@@ -362,14 +442,15 @@ def fit_pressures(
     Boards that are not pressed keep what they have in the calibration `before`.
 
     Raises:
-        RequestError: another number of plateaus than of levels was found, nothing is pressed, or
-            the levels are not those of the plateaus in kPa.
+        RequestError: another number of plateaus than of levels was found, nothing is pressed, the
+            levels are not those of the plateaus in kPa, or the recording has a gap.
     """
     pressure = settings.processing.pressure
     unit_ff = layout.unit_ff / layout.sensitivity
     curve = PressureCurve(unit_ff, 1.0, pressure.a_kpa_per_ff2, pressure.b_kpa_per_ff)
     everyone = np.ones_like(samples.usable)
     moving = moves(samples.units(slice(None), everyone), samples.dt_s, PRESSED_QUANTILES)
+    _check_gaps(samples, moving)
     boards = _pressed_boards(moving, samples, layout)
     typical = _typical_kpa(samples, curve, settings, moving & samples.usable & boards)
     found = plateaus(typical, samples.dt_s)
@@ -416,8 +497,8 @@ def fit_curves(
 
     Raises:
         RequestError: the table is no course of pressure, not of this recording or in another unit,
-            or not that of untouched skin at first; nothing is pressed, or too few pads can be
-            fitted.
+            or not that of untouched skin at first; nothing is pressed, too few pads can be fitted,
+            or the recording has a gap.
     """
     check_course(load)
     path, time_s, kpa = load = on_clock_of(load, samples.start_s)
@@ -426,6 +507,7 @@ def fit_curves(
     pads = samples.received & (layout.pad_kind == PadKind.PRESSURE)
     course = Course(samples.dt_s, samples.raw, samples.zero, pads, np.zeros(len(samples.raw)))
     units, _ = activations(course)
+    _check_gaps(samples, pads & moves(units, samples.dt_s, PRESSED_QUANTILES))
     now_s: Floats = samples.start_s + samples.dt_s * np.arange(len(samples.raw), dtype=np.float64)
     try:
         lag_s = find_lag(median_of_moving(units[:, pads], samples.dt_s), now_s, (time_s, kpa))
@@ -453,8 +535,29 @@ def fit_curves(
         gain, bend = (np.where(renewed, 1.0, old) for old in (before.gain, before.bend))
     joined = curves if kept is None else _joined(kept, curves, renewed)
     calibration = _renewed(samples, before, pressed, gain, bend, joined)
-    known = memory is not None or unloads(steady)
-    return Fitted(calibration, curves, pressed, ratio, pressed & ~renewed, known)
+    is_kept = memory is not None
+    known = is_kept or unloads(steady)
+    return Fitted(calibration, curves, pressed, ratio, pressed & ~renewed, known, is_kept)
+
+
+def _check_gaps(samples: Samples, moving: Mask) -> None:
+    """Check that the boards whose pads move, bool[n], were received throughout.
+
+    What is repeated in a gap would be paired with pressures that it does not belong to.
+
+    Raises:
+        RequestError: one of them was not.
+    """
+    for gap in samples.gaps:
+        if np.any(gap.taxels & moving):
+            raise _gap_error(gap, samples, "throughout")
+
+
+def _gap_error(gap: Gap, samples: Samples, when: str) -> RequestError:
+    return RequestError(
+        f"board {gap.board}: nothing of it was received for {gap.seconds:.1f} s, from "
+        f"{gap.rows.start * samples.dt_s:.1f} s of the recording on; wanted its readings {when}"
+    )
 
 
 def _check_unit(
@@ -517,9 +620,7 @@ def _pressed_boards(pressed: Mask, samples: Samples, layout: Layout) -> Mask:
     found: Mask = np.zeros_like(pads)
     most = 0.0
     for part in layout.parts:
-        for board in part.boards:
-            mine = layout.taxels_of([board])
-            mine[: part.start] = mine[part.stop :] = False
+        for _, mine in _boards_of(layout, part):
             share = float(pressed[mine & pads].mean()) if np.any(mine & pads) else 0.0
             most = max(most, share)
             if share >= PRESSED_SHARE:

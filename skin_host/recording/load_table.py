@@ -48,7 +48,7 @@ def read_table(path: Path) -> LoadTable:
         RequestError: unreadable, or not such a table; the message names file and line.
     """
     try:
-        lines = read_whole(path, LARGEST_BYTES).decode().splitlines()
+        lines = read_whole(path, LARGEST_BYTES).decode("utf-8-sig").splitlines()
     except OSError as error:
         raise RequestError(f"{path}: {error.strerror}; {WANTED}") from None
     except UnicodeDecodeError:
@@ -68,7 +68,7 @@ def read_table(path: Path) -> LoadTable:
             raise RequestError(f'{path}:{number}: "{line[:60]}" is not finite; {WANTED}')
         if rows and time_s <= rows[-1][0]:
             raise RequestError(
-                f"{path}:{number}: time {time_s:g} s follows {rows[-1][0]:g} s; {WANTED}"
+                f"{path}:{number}: time {time_s:.10g} s follows {rows[-1][0]:.10g} s; {WANTED}"
             )
         rows.append((time_s, kpa))
     if len(rows) < 2:
@@ -97,7 +97,7 @@ def check_course(table: LoadTable) -> None:
     longest = int(np.argmax(gaps))
     if gaps[longest] > max(LONGEST_GAP_S, GAP_SAMPLES * float(np.median(gaps))):
         raise RequestError(
-            f"{path}: a gap of {gaps[longest]:.1f} s after {time_s[longest]:g} s; "
+            f"{path}: a gap of {gaps[longest]:.1f} s after {time_s[longest]:.10g} s; "
             "wanted the pressure throughout the recording"
         )
 

@@ -88,7 +88,8 @@ class Picture:
         self._layout = b""
         #: By part, also of parts that no node has named yet: a state is sent only when it changes.
         self._states: dict[str, Contact] = {}
-        self._health: dict[str, tuple[dict[str, Any], float]] = {}
+        #: The last record of each part, and when one came that the broker had not stored, if any.
+        self._health: dict[str, tuple[dict[str, Any], float | None]] = {}
 
     def take_nodes(
         self,
@@ -142,7 +143,8 @@ class Picture:
             self.parts[contact.part].changed["contacts"] += 1
 
     def take_health(self, health: Health, now_s: float) -> None:
-        self._health[health.part] = dict(health.record), now_s
+        _, at_s = self._health.get(health.part, (None, None))
+        self._health[health.part] = dict(health.record), at_s if health.stored else now_s
         if health.part in self.parts:
             self.parts[health.part].changed["health"] += 1
 
@@ -170,7 +172,7 @@ class Picture:
                 news.append(_contacts_text(name, part, self._states.get(name)))
             if name in self._health and (had is None or had["health"] != part.changed["health"]):
                 record, at_s = self._health[name]
-                news.append(_health_text(name, record, now_s - at_s))
+                news.append(_health_text(name, record, None if at_s is None else now_s - at_s))
             if had != part.changed or had is None:
                 cursor.parts[name] = part.changed.copy()
         return news
@@ -284,14 +286,16 @@ class _Record(Struct):
     triangles: list[_Triangle] = []
 
 
-def _health_text(name: str, record: dict[str, Any], age_s: float) -> str:
+def _health_text(name: str, record: dict[str, Any], age_s: float | None) -> str:
+    """Of a record that the broker had stored nobody knows how old it is."""
     try:
         known = msgspec.convert(record, _Record)
     except msgspec.ValidationError as error:
         known = _Record(sentences=[f"This health record cannot be read: {error}."])
     said = [STATES[known.state]] if known.state in STATES else []
     message = msgspec.to_builtins(known) | {"sentences": said + known.sentences}
-    return _json({"type": "health", "part": name, "age_s": round(age_s, 3)} | message)
+    age = None if age_s is None else round(age_s, 3)
+    return _json({"type": "health", "part": name, "age_s": age} | message)
 
 
 def _json(message: dict[str, Any]) -> str:

@@ -259,9 +259,13 @@ def test_frames_of_can_fd_are_passed_over(tmp_path):
     assert batch.id.tolist() == [0x4E0, 0x4E2]
 
 
-def test_a_time_that_no_clock_shows_ends_a_recording(tmp_path):
-    far = candump(tmp_path / "far.log", ["(1.0) can0 4E0#40", "(99999999999999.0) can0 4E0#40"])
-    assert "damaged after frame 1: line 2: a time of 1e+14 s" in message_of(far)
+@pytest.mark.parametrize(
+    ("written", "seen"),
+    [("99999999999999.0", "1e+14"), ("inf", "inf"), ("1e400", "inf"), ("nan", "nan")],
+)
+def test_a_time_that_no_clock_shows_ends_a_recording(tmp_path, written: str, seen: str):
+    far = candump(tmp_path / "far.log", ["(1.0) can0 4E0#40", f"({written}) can0 4E0#40"])
+    assert f"damaged after frame 1: line 2: a time of {seen} s" in message_of(far)
 
 
 BLANK = st.lists(st.sampled_from([b"\n", b"\r\n"]), max_size=4).map(b"".join)

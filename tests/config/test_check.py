@@ -243,6 +243,25 @@ def test_an_interface_that_nothing_here_knows_is_a_warning(seen, meant):
     )
 
 
+@pytest.mark.parametrize(
+    ("channel", "wrong"),
+    [
+        ("239.74.163.2", False),
+        ("ff15::7079:7468", False),
+        ("10.0.0.1", True),
+        ("239.74.163", True),
+        ("can0", True),
+    ],
+)
+def test_a_channel_that_is_no_multicast_group_is_a_warning(channel: str, wrong: bool) -> None:
+    boards: dict[str, dict[str, object]] = {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}}
+    parts = {"arm": {"patches": [{"board": "mtb", "triangles": "0-1"}]}}
+    bus = {"interface": "udp_multicast", "channel": channel}
+    assert described(boards, parts, {"can0": bus})["warnings"] == wrong * [
+        f'buses.can0.channel: "{channel}" is no multicast address; wanted one such as 239.74.163.2'
+    ]
+
+
 def test_foam_in_metres_is_a_warning():
     boards = {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}}
     parts = {"arm": {"foam_mm": 0.002, "patches": [{"board": "mtb", "triangles": "0-1"}]}}

@@ -275,6 +275,30 @@ def test_a_mistake_is_named_with_its_place(tmp_path: Path, old: str, new: str, s
         (TOP, f'{TOP}\nmqtt.base = "a\\nb"', 'mqtt.base: "a\\nb" cannot start a topic'),
         (TOP, f'{TOP}\nmqtt.base = "#"', 'mqtt.base: "#" cannot start a topic'),
         (TOP, f'{TOP}\nmqtt.brokers = ["a\\n"]', "mqtt.brokers"),
+        # Without TLS the broker's files would have no effect, and nothing would be encrypted.
+        (
+            TOP,
+            f'{TOP}\nmqtt.ca_file = "ca.pem"',
+            "mqtt.ca_file: is given, but mqtt.tls is not true",
+        ),
+        (
+            TOP,
+            f'{TOP}\nmqtt.tls = true\nmqtt.key_file = "k.pem"',
+            "mqtt.key_file: needs mqtt.certificate_file too",
+        ),
+        (TOP, f'{TOP}\nmqtt.password_file = "p"', "mqtt.password_file: needs mqtt.username too"),
+        (
+            TOP,
+            f'{TOP}\nmqtt.protocol = "3.1.1"\nmqtt.brokers = ["a", "b"]',
+            'mqtt.brokers: 2 brokers need mqtt.protocol = "5"',
+        ),
+        (
+            TOP,
+            f'{TOP}\nmqtt.port = 1884\nmqtt.brokers = ["a", "[::1]:1884", "a:1884"]',
+            "mqtt.brokers[2]: a:1884 is named twice",
+        ),
+        (TOP, f'{TOP}\nmqtt.brokers = ["a:0"]', "mqtt.brokers[0]: a:0: wanted a port from 1"),
+        (TOP, f'{TOP}\nmqtt.brokers = ["a:70000"]', "mqtt.brokers[0]: a:70000: Port out of range"),
         # A board that is gone would not be missed for as long.
         (TOP, f"{TOP}\nreceive.silent_periods = 1e8", "receive.silent_periods: seen 100000000.0"),
     ],

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.cli import main
-from skin_host.errors import LogError
+from skin_host.errors import LogError, RequestError
 from skin_host.evaluation import insole, page, real, tables
 from skin_host.evaluation.insole import PADS, InsoleRecording
 from skin_host.evaluation.real import PlayedCourse
@@ -363,8 +363,14 @@ def test_recordings_that_are_not_there_are_said_to_be_absent(
         {"counts": np.zeros((5, 280))},
         {"counts": np.zeros((5, 279), np.uint8)},
         {"counts": np.zeros((4, 280), np.uint8)},
-        {"t_s": np.array([0.0, 1.0, 1.0, 2.0, 3.0])},
-        {"t_s": np.array([0.0, 1.0, np.nan, 2.0, 3.0])},
+        {"t_s": np.array([0.0, 1.0, 1.0, 2.0, 8.0])},
+        {"t_s": np.array([0.0, 1.0, np.nan, 2.0, 8.0])},
+        {"t_s": np.arange(5.0)},
+        {"t_s": np.arange(5.0) * 1e-9},
+        {"t_s": np.array([0.0, 1e-9, 1.0, 2.0, 8.0])},
+        {"t_s": np.array(["0", "1", "2", "3", "8"])},
+        {"t_s": np.arange(5.0) * (2.0 + 0.0j)},
+        {"t_s": np.zeros(1), "counts": np.zeros((1, 280), np.uint8)},
         {"pressure_kpa": np.array([])},
         {"pressure_kpa": np.array([1.0, np.inf])},
         {"pressure_kpa": np.array(["a"], dtype=object)},
@@ -374,14 +380,42 @@ def test_what_is_no_recording_is_refused_in_one_line(
     arrays: dict[str, np.ndarray], tmp_path: Path
 ) -> None:
     whole = {
-        "t_s": np.arange(5.0),
+        "t_s": 2.0 * np.arange(5.0),
         "counts": np.zeros((5, 280), np.uint8),
         "pressure_kpa": np.zeros(5),
     }
+    np.savez(tmp_path / "good.npz", **whole)
+    assert len(insole.read(tmp_path / "good.npz").t_ns) == 5
     np.savez(tmp_path / "bad.npz", **(whole | arrays))
     with pytest.raises(LogError, match=r"bad\.npz: ") as error:
         insole.read(tmp_path / "bad.npz")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("samples", [800, 1400])
+def test_a_gap_of_days_is_refused_before_the_memory_for_its_sweeps_is_needed(
+    tmp_path: Path, samples: int
+) -> None:
+    """Also where the pressure ends before it."""
+    made = recording(ramp())
+    t_s = (made.t_ns - made.t_ns[0]) * 1e-9
+    np.savez(
+        tmp_path / "left_calibration.npz",
+        t_s=np.where(np.arange(len(t_s)) < 1000, t_s, t_s + 9e5),
+        counts=made.counts,
+        pressure_kpa=made.pressure_kpa[:samples],
+    )
+    with pytest.raises(RequestError, match=r"a gap of 900000\.0 s after|covers 16 s of the"):
+        real.fit_pressures(tmp_path / "left_calibration.npz")
+
+
+def test_pads_that_are_valid_only_after_the_pressures_record_have_no_errors() -> None:
+    made = recording(ramp())
+    short = replace(made, pressure_kpa=made.pressure_kpa[:100])
+    played = course(made, made.pressure_kpa)
+    played.valid[:200] = False
+    row = real.pressure_errors(short, played, np.ones(PADS, np.bool_), None)
+    assert row["median_rmse_kpa"] is row["zero_kpa"] is None
 
 
 @pytest.mark.parametrize("content", [b"not an archive", b"", None], ids=["text", "none", "npy"])

@@ -110,6 +110,28 @@ def test_a_push_along_a_cylinder_or_beyond_its_end_is_no_contact_on_its_side():
     assert along.verdict[0] == ContactVerdict.NO_SINGLE_CONTACT
 
 
+@pytest.mark.parametrize("slope", [0.0, 1e-12, 1e-8, 1e-4])
+@pytest.mark.parametrize(
+    ("surface", "normal"),
+    [
+        (sphere(13.0), (0.0, 1.0, 0.0)),
+        (cylinder(15.7), (0.0, 1.0, 0.0)),
+        (Plane(), (0.0, 0.0, 1.0)),
+    ],
+    ids=["sphere", "cylinder", "plane"],
+)
+def test_a_push_along_the_surface_is_no_contact_of_endless_error(surface, normal, slope):
+    outward = np.array(normal)
+    radius_mm = 0.0 if isinstance(surface, Plane) else surface.semi_axes_mm[0]
+    along = np.array([1.0, 0.0, 0.0])
+    # Of a line through a round body the share of its force that goes in is that of its distance.
+    point_mm = outward * radius_mm * np.sqrt(1.0 - slope**2)
+    force = 4.0 * along - 4.0 * slope * outward * (radius_mm == 0.0)
+    found = locate(force, np.cross(point_mm, force), surface)
+    assert found.verdict[0] == ContactVerdict.NO_SINGLE_CONTACT
+    assert np.isnan(found.point_mm).all()
+
+
 @pytest.mark.parametrize("name", SURFACES)
 def test_the_sensitivity_is_the_derivative(name):
     surface = SURFACES[name]

@@ -390,6 +390,20 @@ def test_skin_and_force_together_are_better_than_either() -> None:
     assert 0.8 < rms[2] / np.mean(said) < 1.25
 
 
+@pytest.mark.parametrize("force_n", [1.0, 3.7, 11.3, 20.0])
+def test_a_push_that_grazes_the_fingertip_where_its_skin_is_touched_has_no_place(
+    force_n: float,
+) -> None:
+    bench = Bench(radius_mm=8.0)
+    bench.tip.use(Zero(np.zeros(6), NOISE))
+    bench.tip.note_skin([skin_contact(1, [0.0, 8.0, 0.0], 0.5)], 10 * MS)
+    force, torque_nm = np.array([force_n, 0.0, 0.0]), np.array([0.0, 0.0, -8e-3 * force_n])
+    (begin,) = touches(bench.tip.step(Wrench(10 * MS, force, torque_nm, False)))
+    assert begin.load is not None and begin.load.verdict == "no_single_contact"
+    assert begin.centroid_m is None and begin.sigma_m is None
+    assert begin.force_n == pytest.approx(force_n)
+
+
 def test_a_contact_of_skin_beside_pads_that_are_not_valid_is_partial_on_the_fingertip_too() -> None:
     bench = Bench(shape="plane", radius_mm=None)
     felt = skin_contact(1, [0, 0, 0], 0.5)

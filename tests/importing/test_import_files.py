@@ -361,6 +361,40 @@ def test_taxels_that_copy_their_representative_are_fitted_to_the_measured_ones(
     ) in said
 
 
+@pytest.mark.parametrize("by", [-1, 15], ids=["no taxel", "one of another triangle"])
+def test_a_triangle_of_which_no_place_was_measured_keeps_them(
+    tmp_path: Path, forearm: Path, by: int
+) -> None:
+    rows = forearm_rows()
+    represented = np.arange(384) // 12 * 12 + 3
+    represented[:12] = by
+    if by >= 0:
+        rows[:12, :3] = rows[by, :3]
+    file = tmp_path / "forearm.txt"
+    write_rows(file, rows, f"name f\ntaxel2Repr ( {'  '.join(map(str, represented))} )\n")
+    _, layout, said = run("positions", file, forearm)
+    assert (
+        f'{file}:3: triangle 0 of board "b13": by taxel2Repr none of its places is its own'
+    ) in said
+    part = layout.part("forearm")
+    assert layout.position_m[part.start] == pytest.approx(rows[0, :3], abs=0.02)
+    assert np.isfinite(layout.position_m).all()
+
+
+def test_taxels_that_share_one_place_beside_one_without_a_place_are_fitted_to_it(
+    tmp_path: Path, forearm: Path
+) -> None:
+    rows = forearm_rows()
+    rows[:12] = rows[3]
+    rows[6] = 0
+    file = tmp_path / "forearm.txt"
+    write_rows(file, rows)
+    _, layout, said = run("positions", file, forearm)
+    assert "9 taxels without a place, fitted to the other 1, too few" in said
+    part = layout.part("forearm")
+    assert layout.position_m[part.start] == pytest.approx(rows[0, :3], abs=1e-5)
+
+
 @pytest.mark.parametrize(
     ("edit", "said"),
     [

@@ -259,6 +259,46 @@ def test_a_recording_of_several_presses_is_no_hold(bench, tmp_path, capsys):
     assert not bench.with_suffix(".relaxation.json").exists()
 
 
+def with_gap(log, path, begin_s, end_s):
+    """A copy of a recording in which nothing was received for a while."""
+    lines = log.read_text().splitlines(keepends=True)
+    times_s = [float(line[1:18]) - 1.7e9 for line in lines]
+    path.write_text(
+        "".join(
+            line
+            for line, time_s in zip(lines, times_s, strict=True)
+            if not begin_s <= time_s < end_s
+        )
+    )
+    return path
+
+
+@pytest.mark.parametrize("load", [False, True], ids=["alone", "load cell"])
+@pytest.mark.parametrize(("begin_s", "end_s"), [(9.0, 14.0), (248.0, 253.0)])
+def test_a_press_or_release_in_a_gap_is_refused(
+    bench, hold, tmp_path, capsys, begin_s, end_s, load
+):
+    """Its time is not known: the foam would seem to lose a fifth less."""
+    log, load_cell = hold
+    cut = with_gap(log, tmp_path / "cut.log", begin_s, end_s)
+    more = ["--load", load_cell] if load else []
+    status, said = run(capsys, "calibrate", bench, "--relaxation", cut, *more)
+    assert status == 2
+    assert f"palm: nothing of it was received for 5.6 s, from {begin_s:.1f} s" in said.err
+    assert not bench.with_suffix(".relaxation.json").exists()
+
+
+def test_a_gap_while_nothing_moves_is_left_out_of_the_fit(bench, hold, tmp_path, capsys):
+    log, _ = hold
+    found = []
+    for number, recording in enumerate([log, with_gap(log, tmp_path / "cut.log", 300.0, 400.0)]):
+        output = tmp_path / f"{number}.json"
+        status, _ = run(capsys, "calibrate", bench, "--relaxation", recording, "--output", output)
+        assert status == 0
+        found.append(sum(json.loads(output.read_text())["beta"]))
+    assert found[1] == pytest.approx(found[0], abs=0.015)
+
+
 def test_what_is_no_load_cell_is_refused_with_what_is_wanted(bench, hold, capsys):
     log, _ = hold
     for wrong in (bench, bench.with_name("nowhere.csv")):

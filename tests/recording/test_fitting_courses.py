@@ -10,8 +10,20 @@ from numpy.typing import NDArray
 from skin_host.config.settings import load
 from skin_host.daemon.calibrate import calibration_path
 from skin_host.processing.curves import CurveVerdict
-from skin_host.recording.load_table import LoadTable, without_spikes
-from tests.support.limbs import ARM, HZ, PADS, calibrate, ramp, stored, write_config, write_log
+from skin_host.recording.load_table import LoadTable, read_table, without_spikes
+from tests.support.limbs import (
+    ARM,
+    HZ,
+    PADS,
+    calibrate,
+    pressed,
+    ramp,
+    staircase,
+    stored,
+    with_levels,
+    write_config,
+    write_log,
+)
 
 Floats = NDArray[np.float64]
 
@@ -144,3 +156,62 @@ def test_spikes_of_a_table_are_left_out_and_its_steps_are_not() -> None:
 def test_two_lines_of_a_table_are_no_spikes() -> None:
     table = LoadTable(Path("air.csv"), np.array([0.0, 60.0]), np.array([0.0, 80.0]))
     assert without_spikes(table).kpa.tolist() == [0.0, 80.0]
+
+
+@pytest.mark.parametrize("heading", ["time_s,pressure_kpa\r\n", "# chamber 2\r\n", ""])
+def test_a_table_of_a_spreadsheet_is_read_from_its_first_line_on(
+    tmp_path: Path, heading: str
+) -> None:
+    """Spreadsheets write a byte order mark and CRLF."""
+    path = tmp_path / "air.csv"
+    path.write_bytes(f"{heading}0.0,1.5\r\n0.1,2.5\r\n".encode("utf-8-sig"))
+    table = read_table(path)
+    assert table.time_s.tolist() == [0.0, 0.1]
+    assert table.kpa.tolist() == [1.5, 2.5]
+
+
+def without(log: Path, addresses: str, begin_s: float, end_s: float) -> Path:
+    """A recording without what these boards sent in a time after its start."""
+    lines = [
+        line
+        for line in log.read_text().splitlines(keepends=True)
+        if line.split()[2][1] not in addresses or not begin_s <= float(line[1:18]) - 1.7e9 < end_s
+    ]
+    log.write_text("".join(lines))
+    return log
+
+
+@pytest.mark.parametrize("addresses", ["3", "34"], ids=["one board", "all"])
+def test_a_gap_while_a_board_is_pressed_is_named_and_not_its_table(
+    bench: Path, capsys: pytest.CaptureFixture[str], addresses: str
+) -> None:
+    units, table = ramp(bench)
+    log = without(write_log(bench.with_name("air.log"), units), addresses, 30.0, 40.0)
+    assert calibrate(bench, log, table) == 2
+    error = capsys.readouterr().err
+    assert (
+        "board a: nothing of it was received for 10.6 s, from 30.0 s of the recording on; "
+        "wanted its readings throughout"
+    ) in error
+    assert not calibration_path(load(bench), "main").exists()
+
+
+def test_a_board_that_ends_before_its_table_is_named(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units, table = ramp(bench)
+    log = without(write_log(bench.with_name("air.log"), units), "4", 60.0, 100.0)
+    assert calibrate(bench, log, table) == 2
+    assert "board b: nothing of it was received for 32" in capsys.readouterr().err
+
+
+def test_a_gap_of_a_board_that_nothing_presses_is_none_of_the_pressure(bench: Path) -> None:
+    units, table = ramp(bench)
+    log = write_log(bench.with_name("air.log"), pressed(units, ARM))
+    assert calibrate(bench, without(log, "4", 30.0, 40.0), table) == 0
+
+
+def test_a_gap_between_levels_is_named(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write_log(bench.with_name("air.log"), staircase(np.ones(2 * PADS)))
+    assert with_levels(bench, without(log, "3", 22.0, 28.0)) == 2
+    assert "board a: nothing of it was received for 6.6 s, from 22.0 s" in capsys.readouterr().err

@@ -114,8 +114,9 @@ def test_a_limb_that_was_not_pressed_or_not_recorded_keeps_everything(
 
 
 def test_what_keeps_its_curves_keeps_the_hysteresis_of_the_foam_with_them(
-    bench: Path, kept: Path
+    bench: Path, kept: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    said = f"hysteresis of the foam: 0.10 within 12 kPa, kept from {kept} with curves"
     units, table = ramp(bench)
     assert calibrate(bench, write_log(bench.with_name("both.log"), units), table) == 0
     before = stored(bench, kept)
@@ -124,12 +125,15 @@ def test_what_keeps_its_curves_keeps_the_hysteresis_of_the_foam_with_them(
     other = with_curves(before, type(before.curves)(**vars(before.curves) | {"memory": foam}))
     keep(bench, kept, other)
     arm = write_log(bench.with_name("arm.log"), pressed(units, ARM))
+    capsys.readouterr()
     assert calibrate(bench, arm, table) == 0
+    assert said in capsys.readouterr().out
     found = stored(bench, kept).curves
     assert found is not None
     assert found.memory == foam
     # With all limbs in one recording nothing is kept.
     assert calibrate(bench, bench.with_name("both.log"), table) == 0
+    assert "kept from" not in capsys.readouterr().out
     found = stored(bench, kept).curves
     assert found is not None
     assert found.memory != foam

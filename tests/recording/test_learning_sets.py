@@ -160,6 +160,14 @@ def test_a_recording_that_is_nearly_all_gap_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "set").exists()
 
 
+def test_frames_that_share_the_times_of_their_recorder_have_no_rate(tmp_path: Path) -> None:
+    """Of equal times in a recording those of its frames are a nanosecond apart."""
+    times_ms = [100.0 * (n // 4) + 1e-6 * (n % 4) for n in range(400)]
+    with pytest.raises(RequestError, match="arm: its time stands still; it has no rate"):
+        data_set(tmp_path / "set", part("arm", times_ms))
+    assert not (tmp_path / "set").exists()
+
+
 def test_episodes_of_another_data_set_are_neither_mixed_in_nor_replaced(tmp_path: Path) -> None:
     long, short = (part("arm", np.arange(n) * 1000.0) for n in (1500, 20))
     data_set(tmp_path, long)

@@ -259,6 +259,18 @@ def test_a_page_that_opens_later_gets_what_is_old_with_its_age() -> None:
         assert texts(news)["health"]["age_s"] == age_s
 
 
+def test_how_old_stored_health_is_is_not_known_before_other_health_comes() -> None:
+    skin = picture()
+    stored = Health("palm", {"state": "ok"}, stored=True)
+    skin.take_health(stored, NOW_S)
+    assert texts(skin.news(Cursor(), NOW_S + 1.0))["health"]["age_s"] is None
+    skin.take_health(Health("palm", {"state": "ok"}), NOW_S + 2.0)
+    assert texts(skin.news(Cursor(), NOW_S + 3.0))["health"]["age_s"] == 1.0
+    # The connection was lost: it is no older than what came before.
+    skin.take_health(stored, NOW_S + 4.0)
+    assert texts(skin.news(Cursor(), NOW_S + 5.0))["health"]["age_s"] == 3.0
+
+
 def test_a_changed_layout_is_told_with_all_that_is_known() -> None:
     skin = picture()
     cursor = Cursor()

@@ -33,6 +33,8 @@ EPISODE_S = 1000
 MOST_STEPS = 10_000_000
 #: A frame is held for so many periods of its part: one that is lost is bridged, two are a gap.
 HELD_PERIODS = 1.5
+#: Recordings have times in microseconds. Frames that came at one time are apart by less.
+LEAST_PERIOD_NS = 1000
 
 Int64s = NDArray[np.int64]
 
@@ -92,7 +94,7 @@ class _Grid:
                 )
         leader = max(parts, key=lambda part: len(part.seq))
         period_ns = _period_ns(leader)
-        if period_ns == 0.0:
+        if period_ns is not None and period_ns < LEAST_PERIOD_NS:
             raise RequestError(f"{output}: {leader.name}: its time stands still; it has no rate")
         self.fps = 1 if period_ns is None else max(1, round(1e9 / period_ns))
         self.start_ns = min(int(part.t_ns[0]) for part in parts)

@@ -144,7 +144,7 @@ class Model {
     let changed = false;
     for (let i = 0; i < part.n; i++) {
       const thermal = part.thermal[i] && !raw;
-      const known = !blank && !thermal && (raw ? part.raw !== null : part.valid(i));
+      const known = !blank && !thermal && (raw ? part.hasRaw(i) : part.valid(i));
       const crossed = !blank && !thermal && !(known && (part.valid(i) || part.thermal[i]));
       const ringed = known && !raw && part.beyond(i);
       const bits = known * 1 + (known || (blank && !thermal)) * 2 + crossed * 4 + thermal * 8 + ringed * 16;

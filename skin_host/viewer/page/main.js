@@ -67,7 +67,6 @@ function take(data) {
     map.chosen = map.chosen.filter(({ part, taxel }) => taxel < (store.part(part)?.n ?? 0));
     map.relayout();
     showChosen();
-    document.body.dataset.many = String(store.parts.length > 6);
     document.title = `${message.robot} skin`;
     $("robot").textContent = message.robot;
   } else if (message.type === "status") store.status = message;
@@ -258,6 +257,7 @@ function signed(number) { return number < 0 ? `−${-number}` : `+${number}`; }
 function value(part, taxel) {
   if (part.stale(performance.now())) return "stale";
   if (!part.hasFrames) return "no frames are published";
+  if (map.raw && part.raw && !part.hasRaw(taxel)) return "raw 0, or not received";
   if (map.raw) return part.raw ? `raw ${part.raw[taxel]} (${signed(part.raw[taxel] - part.noLoad[taxel])})` : "no raw value";
   if (part.thermal[taxel]) return "feels temperature";
   if (!part.valid(taxel)) return "not valid";
@@ -274,7 +274,8 @@ function showTip() {
   tip.textContent = `${part.name} ${map.cursor.taxel}: ${value(part, map.cursor.taxel)}\nboard ${triangle.board}, triangle ${triangle.number}, pad ${map.cursor.taxel % 12}`;
   const x = Math.min(at[0] + 14, $("stage").clientWidth - tip.offsetWidth - 4);
   tip.style.left = `${Math.max(4, x)}px`;
-  tip.style.top = `${at[1] + 16 + tip.offsetHeight > $("map").clientHeight ? at[1] - tip.offsetHeight - 12 : at[1] + 14}px`;
+  const y = at[1] + 16 + tip.offsetHeight > $("map").clientHeight ? at[1] - tip.offsetHeight - 12 : at[1] + 14;
+  tip.style.top = `${$("drawing").offsetTop + y}px`; // below the banner
 }
 
 /** Names of some parts, or how many there are where they are many. */
@@ -299,7 +300,7 @@ function showStatus(nowMs) {
   let [text, level] = ["", "ok"];
   if (link !== "open") [text, level] = [link === "lost" ? "this page has lost its server; trying again" : "connecting", link === "lost" ? "alarm" : "wait"];
   else if (!store.status.connected) [text, level] = [store.status.error || "connecting", "alarm"];
-  else if (!store.parts.length) [text, level] = ["waiting for a node to say what it is", "wait"];
+  else if (!store.parts.length) [text, level] = ["no node has published what it is: is `skin run` running?", "wait"];
   else if (offline) [text, level] = [`node ${offline} is offline`, "alarm"];
   else if (stale.length) [text, level] = [staleText(stale), "alarm"];
   else if (unknown) [text, level] = [`not known whether node ${unknown} is online`, "wait"];
@@ -350,9 +351,10 @@ function showScale(nowMs) {
   }
   $("scale").disabled = map.raw;
   const share = (value) => shareOf(value, map.top);
-  // Room for a number, and for the unit with the last.
+  // Room for a number, for the unit with the last, and for the words of the first raw value.
   const apart = 46 / Math.max(200, $("ticks").clientWidth);
-  const values = roundTicks(map.top, share, apart).filter((value) => value === map.top || share(value) < 1 - 1.6 * apart);
+  const first = map.raw ? 2.4 * apart : 0;
+  const values = roundTicks(map.top, share, apart).filter((value) => [0, map.top].includes(value) || (share(value) > first && share(value) < 1 - 1.6 * apart));
   const labels = values.map((value) => (map.raw && value ? `−${+value.toPrecision(4)}` : `${+value.toPrecision(4)}`));
   if (map.raw) labels[0] = "raw = no-load";
   else labels[labels.length - 1] += " kPa";
@@ -471,7 +473,8 @@ function forceLines(seconds, fromMs, endMs) {
 function presentForce(nowMs) {
   const known = shownParts().map((part) => part.force(nowMs));
   const sum = known.reduce((total, force) => total + (force ?? 0), 0);
-  return [sum < 1e-9 && known.includes(null) ? null : sum, isLeast(shownParts(), nowMs)];
+  const isKnown = sum >= 1e-9 || (known.length > 0 && !known.includes(null));
+  return [isKnown ? sum : null, isLeast(shownParts(), nowMs)];
 }
 
 /** The same of one contact. */
@@ -511,6 +514,7 @@ function frame(nowMs) {
     const began = performance.now();
     dirty = false;
     drawnMs = nowMs;
+    document.body.dataset.many = String(map.parts.length > 6);
     showScale(nowMs);
     map.draw(nowMs);
     document.body.dataset.drawMs = (performance.now() - began).toFixed(1);

@@ -2,7 +2,7 @@
 import { drawer } from "./body.js";
 import { paper, ramp, shareOf } from "./colours.js";
 import { told } from "./panels.js";
-import { isBound } from "./store.js";
+import { ageText, isBound } from "./store.js";
 
 const GAP_MM = 14;
 const LABEL_PX = 20;
@@ -365,7 +365,7 @@ export class SkinMap {
     ctx.textAlign = "center";
     ctx.textBaseline = "bottom";
     ctx.fillStyle = stale ? look.alarm : look.dim;
-    const age = part.heardMs === null ? "no data" : `stale, ${((nowMs - part.heardMs) / 1000).toFixed(0)} s`;
+    const age = part.heardMs === null ? "no data" : `stale, ${ageText(part.heardMs, nowMs)}`;
     const words = stale ? `${part.name}: ${age}` : part.hasFrames ? part.name : `${part.name}: touches only`;
     // What does not fit without touching the next label is told by its colour, and beside Health.
     ctx.fillText(ctx.measureText(words).width + 8 < room * scale ? words : part.name, lx, ly, this.canvas.clientWidth);
@@ -389,7 +389,7 @@ export class SkinMap {
       const behind = pose.towards[i] < 0;
       if (part.thermal[i] && !this.raw) { if (!behind && r > 3) squares.push(x, y, r); }
       else if (blank) { if (!behind) rings.push(x, y, r, look.rim); }
-      else if (this.raw ? !part.raw : !part.valid(i)) { if (!behind) crosses.push(x, y, r); }
+      else if (this.raw ? !part.hasRaw(i) : !part.valid(i)) { if (!behind) crosses.push(x, y, r); }
       else {
         const value = this.raw ? part.noLoad[i] - part.raw[i] : part.pressure[i];
         const level = Math.round(255 * shareOf(value, this.top));

@@ -1,11 +1,11 @@
 // Contacts, health, parts: what stands in words beside the map.
-import { isBound } from "./store.js";
+import { ageText, isBound } from "./store.js";
 
 const LEVELS = { ok: "ok", warning: "warn", degraded: "warn", disabled: "warn" };
 
 export function level(part, nowMs) {
   if (part.stale(nowMs)) return "alarm";
-  return part.health ? LEVELS[part.health.state] ?? "alarm" : "ok";
+  return part.lacksHealth(nowMs) ? "warn" : LEVELS[part.health.state] ?? "alarm";
 }
 
 /** Keep DOM nodes that stay, so that focus and selection stay too. */
@@ -120,11 +120,15 @@ const ORDER = ["alarm", "warn", "ok"];
 function stateOf(part, nowMs) {
   if (part.heardMs === null && part.health?.state === "not calibrated") return "not calibrated";
   if (part.heardMs === null) return "no data";
-  return part.stale(nowMs) ? "stale" : part.health?.state ?? "ok";
+  if (part.stale(nowMs)) return "stale";
+  return part.lacksHealth(nowMs) ? "no health" : part.health.state;
 }
 
 /** Whether what was known of a part is over: its data came, and come no more. */
 function isOver(part, nowMs) { return part.heardMs !== null && part.stale(nowMs); }
+
+/** Whether what its health stated is true now. */
+function isStated(part, nowMs) { return !isOver(part, nowMs) && !part.isHealthOld(nowMs); }
 
 /** Sentences that more than one part has, but for its own name: [sentence, how many]. */
 function sharedSentences(parts) {
@@ -138,7 +142,7 @@ function sharedSentences(parts) {
 export function showHealth(box, list, parts, nowMs) {
   if (!parts.length) return;
   if (box.querySelector(".hint")) box.replaceChildren();
-  const shared = sharedSentences(parts.filter((part) => !isOver(part, nowMs)));
+  const shared = sharedSentences(parts.filter((part) => isStated(part, nowMs)));
   keep(list, shared.length, () => document.createElement("li")).forEach((item, i) => put(item, `${shared[i][0]} (${shared[i][1]} parts)`));
   list.hidden = !shared.length;
   const once = new Set(shared.map(([says]) => says));
@@ -212,7 +216,7 @@ function fill(article, part, once, nowMs) {
   const taxels = `${part.valids(nowMs) ?? "?"} of ${part.health?.taxels ?? part.n} taxels valid`;
   const frames = part.hasFrames ? `${part.rate(nowMs).toFixed(1)} frames/s, ${part.missed} missed` : "no frames are published";
   put(rates, part.fingertip ? `${told(stale ? null : part.health?.rate_hz, 0, "samples/s")} of force and torque` : `${frames}, ${taxels}`);
-  const sentences = (part.health?.sentences ?? []).filter((says) => isOver(part, nowMs) || !once.has(says));
+  const sentences = (part.health?.sentences ?? []).filter((says) => !isStated(part, nowMs) || !once.has(says));
   const said = [...ages(part, nowMs, sentences.length ? "; before that:" : "."), ...sentences];
   keep(list, said.length, () => document.createElement("li")).forEach((item, k) => put(item, said[k]));
   list.hidden = !said.length;
@@ -220,12 +224,13 @@ function fill(article, part, once, nowMs) {
 
 /** What has stopped to come, and since when. */
 function ages(part, nowMs, end) {
-  const since = (ms) => `for ${((nowMs - ms) / 1000).toFixed(0)} s${end}`;
+  const since = (ms) => `for ${ageText(ms, nowMs)}${end}`;
   if (isOver(part, nowMs)) {
     const isLate = part.why === "stale" && nowMs - part.heardMs < 1000;
     return [isLate ? "What comes is too late to be true." : `${part.hasFrames ? "No frame" : "Nothing"} ${since(part.heardMs)}`];
   }
-  return part.heardMs !== null && part.isHealthOld(nowMs) ? [`No health ${since(part.healthMs)}`] : [];
+  if (part.heardMs === null || !part.lacksHealth(nowMs)) return [];
+  return [part.healthMs === null ? `No health has come yet${end}` : `No health ${since(part.healthMs)}`];
 }
 
 /** A number with its unit, and whether it is a bound from below; where there is no skin there is no pressure and no area. */

@@ -21,6 +21,9 @@ const NOT_IN_USE = ["not calibrated", "disabled"];
 /** Whether a contact presses at least as hard as its force: a board at the end of its range, pads beyond theirs, or not valid. */
 export function isBound({ verdict, partial, beyond }) { return verdict === null ? partial || beyond : verdict === "saturated"; }
 
+/** In words how long ago something was; what comes while a picture is drawn is newer than the picture. */
+export function ageText(atMs, nowMs) { return `${(Math.max(0, nowMs - atMs) / 1000).toFixed(0)} s`; }
+
 export class Part {
   constructor(info) {
     this.name = info.name;
@@ -87,6 +90,10 @@ export class Part {
   }
 
   valid(i) { return (this.bits[i] & VALID) !== 0; }
+
+  /** Whether its board sends a byte of it; 0 stands for one that was not received, and a dead chip may send it. */
+  hasRaw(i) { return this.raw !== null && (this.raw[i] !== 0 || this.valid(i)); }
+
   beyond(i) { return (this.bits[i] & BEYOND) !== 0; }
   triangleOf(i) { return this.triangles[Math.floor(i / 12)]; }
 
@@ -130,13 +137,16 @@ export class Part {
     return this.stale(nowMs) || this.isHealthOld(nowMs) ? null : this.health?.valid_taxels ?? null;
   }
 
-  isHealthOld(nowMs) { return this.health !== null && nowMs - this.healthMs > HEALTH_MS; }
+  isHealthOld(nowMs) { return this.health !== null && (this.healthMs === null || nowMs - this.healthMs > HEALTH_MS); }
+
+  /** Whether its state is not known, though its frames may come. */
+  lacksHealth(nowMs) { return this.health === null || this.isHealthOld(nowMs); }
 
   remember(nowMs) {
     this.past.add(nowMs, this.pressure.map((value, i) => (this.bits[i] & VALID ? value : NaN)));
     if (!this.raw) return;
     this.pastRaw ??= new History(this.n);
-    this.pastRaw.add(nowMs, this.raw);
+    this.pastRaw.add(nowMs, Array.from(this.raw, (byte, i) => (this.hasRaw(i) ? byte : NaN)));
   }
 
   /** [time, value] of a taxel between two times: kPa, or raw values less those of untouched skin. */
@@ -197,8 +207,8 @@ export class Store {
     const part = this.part(message.part);
     if (!part) return;
     part.health = message;
-    part.healthMs = nowMs - 1000 * message.age_s;
-    if (!part.hasFrames) { part.hear(part.healthMs); part.rememberForces(nowMs); }
+    part.healthMs = message.age_s === null ? null : nowMs - 1000 * message.age_s; // null: the broker had stored it
+    if (!part.hasFrames && part.healthMs !== null) { part.hear(part.healthMs); part.rememberForces(nowMs); }
     part.faults = new Set((message.triangles ?? []).map((t) => `${t.board}/${t.triangle}`));
   }
 }

@@ -64,7 +64,7 @@ export class Plot {
       },
       axes: [
         { ...axis, size: 22, gap: 2, splits: () => this.times(), values: (_, splits) => splits.map((s) => this.timeText(s)) },
-        { ...axis, size: 52, gap: 4, splits: () => [0, this.top / 2, this.top], values: (_, splits) => splits.map((value) => `${+value.toPrecision(3)}${value === this.top ? ` ${this.unit}` : ""}`) },
+        { ...axis, size: 60, gap: 4, splits: () => [0, this.top / 2, this.top], values: (_, splits) => splits.map((value) => `${+value.toPrecision(3)}${value === this.top ? ` ${this.unit}` : ""}`) },
       ],
       series: [{}, ...lines.map(({ colour, dash }) => ({ stroke: colour, dash, width: 2, points: { show: false } }))],
       hooks: { setCursor: [(plot) => this.point(plot.cursor.left >= 0 ? -1000 * plot.posToVal(plot.cursor.left, "x") : null)] },

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -348,6 +349,15 @@ async def test_nothing_touches_only_what_is_known_to_be_untouched(
         assert await seen.run(CONTACTS) == []
 
 
+async def test_of_a_robot_that_is_not_there_no_force_is_known(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    async with viewing(mosquitto, "nobody", tmp_path / "p") as seen:
+        status = 'document.getElementById("status").textContent'
+        await seen.until(f"/is `skin run` running/.test({status})")
+        await seen.until(f"{TOTAL} === 'total: not known'")
+
+
 @asynccontextmanager
 async def untouched(mosquitto: Mosquitto, profile: Path) -> AsyncIterator[Page]:
     """The page of a skin whose frames, health and contacts come, and nothing touches."""
@@ -536,6 +546,103 @@ async def test_raw_values_stay_while_any_node_sends_them(
         await seen.until('document.getElementById("banner").textContent === "no"')
 
 
+#: Two parts of one taxel each, of a node that sends raw values; its byte, and its bits.
+RAW_SERVER = """(() => {
+    const socket = window.sockets.at(-1);
+    socket.send = () => {};
+    const take = socket.onmessage;
+    // Of the server itself nothing comes any more.
+    socket.onmessage = () => {};
+    const say = message => take.call(socket, { data: JSON.stringify(message) });
+    const part = name => ({
+        name, node: "main", period_ms: 50, pads: ["pressure"], position_m: [[0, 0, 0]],
+        normal: [[0, 0, 1]], radius_mm: [2], area_mm2: [20], triangles: [
+            { board: "b", number: 0, kind: "x", first: 0, no_load: 240,
+              outline_m: [[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]] },
+        ],
+    });
+    say({ type: "layout", version: 10, robot: "r", parts: [part("palm"), part("wrist")],
+          nodes: { main: { commands: true } } });
+    say({ type: "status", connected: true, commands: true, error: "", nodes: { main: true } });
+    let seq = 0;
+    window.bytes = (number, byte, bits) => {
+        const view = new DataView(new ArrayBuffer(42));
+        view.setUint8(0, 1);
+        view.setUint8(1, 1);
+        view.setUint16(2, number, true);
+        view.setUint32(4, 1, true);
+        view.setUint32(8, 10, true);
+        view.setUint32(12, ++seq, true);
+        view.setFloat64(16, seq / 20, true);
+        view.setUint8(40, bits);
+        view.setUint8(41, byte);
+        take.call(socket, { data: view.buffer });
+    };
+})()"""
+
+
+async def test_a_byte_that_was_not_received_is_no_press(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """Frames hold 0 for it, which a pad that is pressed to the end of its scale sends, too."""
+    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        await seen.run(RAW_SERVER)
+        await seen.run("setInterval(() => { bytes(0, 0, 0); bytes(1, 0, 1); }, 50)")
+        await seen.run('document.getElementById("show-raw").click()')
+        for key in (".", "Enter", ".", "Enter"):
+            await seen.press(key)
+        chosen = 'document.getElementById("chosen").innerText'
+
+        async def shows(*lines: str) -> None:
+            await seen.until(f"{chosen} === {json.dumps(chr(10).join(lines))}")
+
+        await shows("palm 0: raw 0, or not received", "wrist 0: raw 0 (−240)")
+        # In the plot, too, only one of them is pressed.
+        await seen.run('document.getElementById("strip").focus()')
+        await seen.press("ArrowLeft")
+        await shows("palm 0: –", "wrist 0: −240 units")
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+async def test_the_words_at_the_scale_of_raw_values_stand_apart(
+    mosquitto: Mosquitto, tmp_path: Path, width: int
+) -> None:
+    async with viewing(mosquitto, "nobody", tmp_path / "p", width, watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        await seen.run(RAW_SERVER)
+        await seen.run("setInterval(() => { bytes(0, 230, 1); bytes(1, 239, 1); }, 50)")
+        await seen.run('document.getElementById("show-raw").click()')
+        await seen.until(f'{TICKS}[0] === "raw = no-load"')
+        boxes = await seen.run("""[...document.querySelectorAll("#ticks span")]
+            .map(tick => tick.getBoundingClientRect()).map(box => [box.left, box.right])""")
+        assert len(boxes) > 2
+        assert all(one[1] < other[0] for one, other in pairwise(boxes)), boxes
+
+
+async def test_what_is_at_the_cursor_stands_beside_it_under_a_banner(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    async with viewing(mosquitto, "nobody", tmp_path / "p", 400, watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        await seen.run(RAW_SERVER)
+        await seen.run("setInterval(() => { bytes(0, 230, 1); bytes(1, 230, 1); }, 50)")
+        await seen.press(".")
+        # How far below the name of its part it stands, on the map.
+        below = """document.getElementById("tip").hidden ? null
+            : document.getElementById("tip").getBoundingClientRect().top
+                - document.getElementById("map").getBoundingClientRect().top
+                - window.labels.find(([text]) => text.startsWith("palm"))[2]"""
+        before = await seen.until(below)
+        # The connection is lost: the banner stands above the map.
+        await seen.run("window.sockets.at(-1).onclose()")
+        high = await seen.until('document.getElementById("banner").offsetHeight')
+        assert high > 30
+        draws = await seen.run("Number(document.body.dataset.draws)")
+        await seen.until(f"Number(document.body.dataset.draws) > {draws} + 2")
+        assert await seen.run(below) == pytest.approx(before, abs=high / 2)
+
+
 async def test_what_is_old_when_the_page_opens_is_not_shown_as_present(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
@@ -565,6 +672,52 @@ async def test_what_is_old_when_the_page_opens_is_not_shown_as_present(
         # The same frame again, as after a new connection, is as old as it was.
         await seen.run("pressed(0, 3001)")
         await seen.until(f"/No frame for 30[0-9][0-9] s/.test({HEALTH})")
+
+
+async def test_a_part_without_health_is_not_called_well(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """Its frames come; its health does not: a broker's rules or its packet limit may keep it."""
+    async with untouched(mosquitto, tmp_path / "p") as seen:
+        await seen.run("health('palm', 6)")
+        await seen.until(f"/No health for [67] s/.test({HEALTH})")
+        palm, wrist, tip = await seen.run(
+            """['palm', 'wrist', 'tip'].map(part => document.querySelector(
+                `#health article[data-part="${part}"]`)).map(one => [
+                    one.dataset.level, one.querySelector("h3").innerText.split("\\n").at(-1),
+                    one.querySelector("ul").innerText])"""
+        )
+        assert palm[:2] == ["warn", "no health"]
+        assert wrist == ["warn", "no health", "No health has come yet."]
+        assert tip == ["ok", "ok", ""]
+        levels = '[...document.querySelectorAll("#parts [data-part]")].map(b => b.dataset.level)'
+        assert await seen.run(levels) == ["", "warn", "warn", "ok"]
+        await seen.run("health('palm', 0)")
+        assert await seen.until(f"({levels})[1] === 'ok'")
+
+
+async def test_what_the_broker_had_stored_shows_no_part_as_well(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """A robot that was switched off has left its last health there."""
+    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        await seen.run(SERVER)
+        await seen.run("health('tip', null); health('palm', null); pressed(0, 0)")
+        states = """JSON.stringify(['palm', 'tip'].map(part => document.querySelector(
+            `#health article[data-part="${part}"] h3`)?.innerText.split("\\n").at(-1)))"""
+        await seen.until(f"""{states} === '["no health","no data"]'""")
+        assert "No health has come yet" in await seen.run(HEALTH)
+        await seen.run("health('tip', 0); health('palm', 0); pressed(0, 0)")
+        await seen.until(f"""{states} === '["ok","ok"]'""")
+
+
+async def test_an_age_is_never_below_zero(mosquitto: Mosquitto, tmp_path: Path) -> None:
+    """What comes while a picture is drawn is newer than the picture."""
+    async with untouched(mosquitto, tmp_path / "p") as seen:
+        await seen.run("contacts('palm', 'UNKNOWN', 'stale'); pressed(0, -0.3)")
+        labels = "window.labels.map(([text]) => text).find(text => text.startsWith('palm: stale'))"
+        assert await seen.until(labels) == "palm: stale, 0 s"
 
 
 async def test_the_skin_can_be_calibrated_from_the_page(robot: Stack, tmp_path: Path) -> None:
@@ -660,7 +813,8 @@ async def test_a_curved_part_turns_beside_others(robot: Stack, tmp_path: Path, b
         await seen.run('document.getElementById("map").focus()')
         await seen.press(",")
         await seen.until("/^left_forearm/.test(document.getElementById('tip').textContent)")
-        before = await seen.until(POSE)
+        # A banner makes the map smaller.
+        before = await seen.until(f"document.getElementById('banner').hidden && {POSE}")
         left, top, width, height = await seen.box("#map")
         places = [(left + share * width, top + 0.5 * height) for share in (0.7, 0.75, 0.8)]
         if by == "touch":
@@ -769,6 +923,9 @@ async def test_a_whole_robot_is_one_line_that_opens_and_its_labels_keep_apart(
                 apart = abs(x - other_x) >= (wide + other_wide) / 2 or abs(y - other_y) >= 15
                 assert apart
         assert await seen.run("document.documentElement.scrollWidth") == width
+        # One part needs no more height than the window has.
+        await seen.run('document.querySelectorAll("#parts button")[1].click()')
+        await seen.until('document.getElementById("stage").offsetHeight < innerHeight')
 
 
 @pytest.mark.skipif(not SAMPLES.exists(), reason=f"{SAMPLES} is not here")
