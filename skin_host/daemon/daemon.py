@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import msgspec
@@ -247,10 +247,8 @@ class Daemon:
                 )
             self.engine.use(found, boards)
             use_measurements(self._contacts, self.engine)
-            stuck = self.engine.stuck() & measured
-            for index, contact in self._contacts.items():
-                part = self.layout.parts[index]
-                contact.stop_waiting(stuck[part.start : part.stop])
+            for contact, stuck in self._contacts_of(self.engine.stuck() & measured):
+                contact.stop_waiting(stuck)
             # The other boards keep their zeros.
             former = known if boards is not None else None
             await self.keeper.keep_calibration(measured, former, doubted)
@@ -372,9 +370,16 @@ class Daemon:
 
     def _doubt_contacts(self, taxels: NDArray[np.bool_], parts: list[int]) -> None:
         """Something may touch these taxels of some parts, bool[n], whose zero is not known."""
-        for index in parts:
+        for contact, doubted in self._contacts_of(taxels, parts):
+            contact.doubt(doubted)
+
+    def _contacts_of(
+        self, taxels: NDArray[np.bool_], parts: Sequence[int] | None = None
+    ) -> Iterator[tuple[PartContact, NDArray[np.bool_]]]:
+        """Yield the contacts of some parts, all by default, each with its own of taxels bool[n]."""
+        for index in self._contacts if parts is None else parts:
             part = self.layout.parts[index]
-            self._contacts[index].doubt(taxels[part.start : part.stop])
+            yield self._contacts[index], taxels[part.start : part.stop]
 
     def _end_contacts(self, part: int) -> None:
         events = self.engine.end_part(part, self.clock.now_ns())

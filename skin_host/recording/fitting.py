@@ -44,12 +44,11 @@ from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model, parameters_of
 from skin_host.recording import seconds as in_seconds
 from skin_host.recording.load_table import (
-    GAP_SAMPLES,
-    LONGEST_GAP_S,
     LoadTable,
     check_course,
     check_covers,
     check_untouched,
+    longest_gap_s,
     on_clock_of,
     without_spikes,
 )
@@ -260,7 +259,7 @@ def _gaps_of(
         came_ns = times_ns[valid[:, taxels[part.start : part.stop]].any(axis=1)]
         if len(came_ns) < 2:
             continue
-        longest_ns = max(LONGEST_GAP_S * 1e9, GAP_SAMPLES * float(np.median(np.diff(came_ns))))
+        longest_ns = longest_gap_s(np.diff(came_ns) * 1e-9) * 1e9
         # Before its first frame the skin is untouched as it is then.
         edges_ns = np.concatenate([came_ns, grid_ns[-1:]])
         for gap in np.flatnonzero(np.diff(edges_ns) > longest_ns).tolist():

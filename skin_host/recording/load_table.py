@@ -95,11 +95,16 @@ def check_course(table: LoadTable) -> None:
         )
     gaps = np.diff(time_s)
     longest = int(np.argmax(gaps))
-    if gaps[longest] > max(LONGEST_GAP_S, GAP_SAMPLES * float(np.median(gaps))):
+    if gaps[longest] > longest_gap_s(gaps):
         raise RequestError(
             f"{path}: a gap of {gaps[longest]:.1f} s after {time_s[longest]:.10g} s; "
             "wanted the pressure throughout the recording"
         )
+
+
+def longest_gap_s(distances_s: Floats) -> float:
+    """Return how far apart samples may be that are usually so far apart [k], in seconds."""
+    return max(LONGEST_GAP_S, GAP_SAMPLES * float(np.median(distances_s)))
 
 
 def without_spikes(table: LoadTable) -> LoadTable:

@@ -9,6 +9,7 @@ import pytest
 from emulator.probes.scene import Fault, Place, Probe, Scene
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
+from skin_host.daemon.daemon import Daemon
 from skin_host.mqtt.messages import ContactState
 from tests.support.broker import Mosquitto
 from tests.support.live import FINGER_N, Live, living
@@ -42,29 +43,36 @@ async def test_a_board_that_dies_during_a_touch_never_looks_untouched(
     assert b"OFF" not in subscriber.payloads("left_hand/contact")[3:]
 
 
+def press_of_the_hand(until_s: float) -> Scene:
+    """A press that begins after eight seconds and lasts for so long."""
+    course = [(0, 0), (0.1, 60), (until_s, 60), (until_s + 0.1, 0), (1000, 0)]
+    place = Place(triangle=4)
+    press = Probe(part="left_hand", at=place, diameter_mm=10, pressure_kpa=course, start_s=8.0)
+    return Scene(quiet=True, probe=[press])
+
+
+def states_of_the_hand(daemon: Daemon) -> list[str]:
+    """Return a list of what is published as contact of the hand from now on."""
+    states: list[str] = []
+
+    def note(part: str, state: ContactState) -> None:
+        if part == "left_hand":
+            states.append(state)
+
+    daemon.publisher.put_contact = note  # type: ignore[method-assign]
+    return states
+
+
 @stepped
 async def test_a_part_that_is_enabled_again_may_be_touched_where_it_failed_meanwhile(
     clock: SteppedClock, tmp_path: Path
 ) -> None:
     """A pad was pressed while nothing of its part was published, and nobody saw it released."""
-    press = Probe(
-        part="left_hand",
-        at=Place(triangle=4),
-        diameter_mm=10,
-        pressure_kpa=[(0, 0), (0.1, 60), (8, 60), (8.1, 0), (1000, 0)],
-        start_s=8.0,
-    )
-    bus, scene = Bus(interface="virtual", channel="enabled"), Scene(quiet=True, probe=[press])
+    bus, scene = Bus(interface="virtual", channel="enabled"), press_of_the_hand(8.0)
     async with living(bus, tmp_path, scene=scene, clock=clock) as live:
         daemon = live.daemon
         await live.until_well(but=frozenset({"board_rezeroed"}))
-        said: list[str] = []
-
-        def note(part: str, state: ContactState) -> None:
-            if part == "left_hand":
-                said.append(state)
-
-        daemon.publisher.put_contact = note  # type: ignore[method-assign]
+        said = states_of_the_hand(daemon)
         daemon.disable(0)
         zeros, board = daemon.engine.zeros, daemon.layout.boards[0]
         await live.wait(lambda: bool(zeros.at_risk(touched=True).any()))
@@ -89,24 +97,11 @@ async def test_a_pad_that_stuck_in_a_touch_keeps_its_part_unknown_until_a_calibr
     clock: SteppedClock, tmp_path: Path
 ) -> None:
     """Nobody can see it released, and a calibration at rest has nothing new of it either."""
-    press = Probe(
-        part="left_hand",
-        at=Place(triangle=4),
-        diameter_mm=10,
-        pressure_kpa=[(0, 0), (0.1, 60), (4, 60), (4.1, 0), (1000, 0)],
-        start_s=8.0,
-    )
-    bus, scene = Bus(interface="virtual", channel="stuck"), Scene(quiet=True, probe=[press])
+    bus, scene = Bus(interface="virtual", channel="stuck"), press_of_the_hand(4.0)
     async with living(bus, tmp_path, scene=scene, clock=clock) as live:
         daemon = live.daemon
         await live.until_well(but=frozenset({"board_rezeroed"}))
-        states: list[str] = []
-
-        def note(part: str, state: ContactState) -> None:
-            if part == "left_hand":
-                states.append(state)
-
-        daemon.publisher.put_contact = note  # type: ignore[method-assign]
+        states = states_of_the_hand(daemon)
         zeros, board = daemon.engine.zeros, daemon.layout.boards[0]
         await live.wait(lambda: bool(zeros.felt.any()))
         taxel = int(np.flatnonzero(zeros.felt)[0])

@@ -18,6 +18,7 @@ from skin_host.layout import build_layout
 from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.pressure import PressureCurve
 from skin_host.recording.fitting import plateaus
+from tests.support.limbs import without
 
 HZ = 5.0
 TRIANGLES = np.array([0, 1])
@@ -259,20 +260,6 @@ def test_a_recording_of_several_presses_is_no_hold(bench, tmp_path, capsys):
     assert not bench.with_suffix(".relaxation.json").exists()
 
 
-def with_gap(log, path, begin_s, end_s):
-    """A copy of a recording in which nothing was received for a while."""
-    lines = log.read_text().splitlines(keepends=True)
-    times_s = [float(line[1:18]) - 1.7e9 for line in lines]
-    path.write_text(
-        "".join(
-            line
-            for line, time_s in zip(lines, times_s, strict=True)
-            if not begin_s <= time_s < end_s
-        )
-    )
-    return path
-
-
 @pytest.mark.parametrize("load", [False, True], ids=["alone", "load cell"])
 @pytest.mark.parametrize(("begin_s", "end_s"), [(9.0, 14.0), (248.0, 253.0)])
 def test_a_press_or_release_in_a_gap_is_refused(
@@ -280,7 +267,7 @@ def test_a_press_or_release_in_a_gap_is_refused(
 ):
     """Its time is not known: the foam would seem to lose a fifth less."""
     log, load_cell = hold
-    cut = with_gap(log, tmp_path / "cut.log", begin_s, end_s)
+    cut = without(log, begin_s, end_s, output=tmp_path / "cut.log")
     more = ["--load", load_cell] if load else []
     status, said = run(capsys, "calibrate", bench, "--relaxation", cut, *more)
     assert status == 2
@@ -291,7 +278,8 @@ def test_a_press_or_release_in_a_gap_is_refused(
 def test_a_gap_while_nothing_moves_is_left_out_of_the_fit(bench, hold, tmp_path, capsys):
     log, _ = hold
     found = []
-    for number, recording in enumerate([log, with_gap(log, tmp_path / "cut.log", 300.0, 400.0)]):
+    cut = without(log, 300.0, 400.0, output=tmp_path / "cut.log")
+    for number, recording in enumerate([log, cut]):
         output = tmp_path / f"{number}.json"
         status, _ = run(capsys, "calibrate", bench, "--relaxation", recording, "--output", output)
         assert status == 0

@@ -21,6 +21,7 @@ from tests.support.limbs import (
     staircase,
     stored,
     with_levels,
+    without,
     write_config,
     write_log,
 )
@@ -170,23 +171,12 @@ def test_a_table_of_a_spreadsheet_is_read_from_its_first_line_on(
     assert table.kpa.tolist() == [1.5, 2.5]
 
 
-def without(log: Path, addresses: str, begin_s: float, end_s: float) -> Path:
-    """A recording without what these boards sent in a time after its start."""
-    lines = [
-        line
-        for line in log.read_text().splitlines(keepends=True)
-        if line.split()[2][1] not in addresses or not begin_s <= float(line[1:18]) - 1.7e9 < end_s
-    ]
-    log.write_text("".join(lines))
-    return log
-
-
 @pytest.mark.parametrize("addresses", ["3", "34"], ids=["one board", "all"])
 def test_a_gap_while_a_board_is_pressed_is_named_and_not_its_table(
     bench: Path, capsys: pytest.CaptureFixture[str], addresses: str
 ) -> None:
     units, table = ramp(bench)
-    log = without(write_log(bench.with_name("air.log"), units), addresses, 30.0, 40.0)
+    log = without(write_log(bench.with_name("air.log"), units), 30.0, 40.0, addresses=addresses)
     assert calibrate(bench, log, table) == 2
     error = capsys.readouterr().err
     assert (
@@ -200,7 +190,7 @@ def test_a_board_that_ends_before_its_table_is_named(
     bench: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     units, table = ramp(bench)
-    log = without(write_log(bench.with_name("air.log"), units), "4", 60.0, 100.0)
+    log = without(write_log(bench.with_name("air.log"), units), 60.0, 100.0, addresses="4")
     assert calibrate(bench, log, table) == 2
     assert "board b: nothing of it was received for 32" in capsys.readouterr().err
 
@@ -208,10 +198,10 @@ def test_a_board_that_ends_before_its_table_is_named(
 def test_a_gap_of_a_board_that_nothing_presses_is_none_of_the_pressure(bench: Path) -> None:
     units, table = ramp(bench)
     log = write_log(bench.with_name("air.log"), pressed(units, ARM))
-    assert calibrate(bench, without(log, "4", 30.0, 40.0), table) == 0
+    assert calibrate(bench, without(log, 30.0, 40.0, addresses="4"), table) == 0
 
 
 def test_a_gap_between_levels_is_named(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = write_log(bench.with_name("air.log"), staircase(np.ones(2 * PADS)))
-    assert with_levels(bench, without(log, "3", 22.0, 28.0)) == 2
+    assert with_levels(bench, without(log, 22.0, 28.0, addresses="3")) == 2
     assert "board a: nothing of it was received for 6.6 s, from 22.0 s" in capsys.readouterr().err

@@ -67,6 +67,22 @@ def write_log(path: Path, units: Floats, boards: tuple[int, ...] = BOARDS, seed:
     return path
 
 
+def without(
+    log: Path, begin_s: float, end_s: float, *, addresses: str = "", output: Path | None = None
+) -> Path:
+    """Take what boards, all by default, sent in a time after its start out of a log, or of a copy
+    of it.
+    """
+
+    def is_left(line: str) -> bool:
+        is_theirs = not addresses or line.split()[2][1] in addresses
+        return not (is_theirs and begin_s <= float(line[1:18]) - 1.7e9 < end_s)
+
+    output = log if output is None else output
+    output.write_text("".join(filter(is_left, log.read_text().splitlines(keepends=True))))
+    return output
+
+
 def pressed(units: Floats, *limbs: slice) -> Floats:
     """Activations [t, 48] of which only these limbs are pressed."""
     found = np.zeros((len(units), 2 * PADS))

@@ -74,8 +74,9 @@ MANY_PARTS = """(() => {
     const before = draws();
     return new Promise(done => setTimeout(() => done(draws() > before), 600));
 })()"""
-#: What a server would send of two parts with one taxel each and of a fingertip.
-SERVER = """(() => {
+#: Parts with one taxel each, and their frames: what a server would send of them.
+PARTS = """(() => {
+    const socket = window.sockets.at(-1);
     const part = (name, more = {}) => ({
         name, node: "main", period_ms: 50, pads: ["pressure"], position_m: [[0, 0, 0]],
         normal: [[0, 0, 1]], radius_mm: [2], area_mm2: [20], triangles: [
@@ -83,9 +84,28 @@ SERVER = """(() => {
               outline_m: [[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]] },
         ], ...more,
     });
+    let seq = 0;
+    const frameOf = (version, number, age_s, bits, ...raw) => {
+        const view = new DataView(new ArrayBuffer(41 + raw.length));
+        view.setUint8(0, 1);
+        view.setUint8(1, raw.length);
+        view.setUint16(2, number, true);
+        view.setUint32(4, 1, true);
+        view.setUint32(8, version, true);
+        view.setUint32(12, ++seq, true);
+        view.setFloat64(16, seq / 20, true);
+        view.setFloat32(32, age_s, true);
+        view.setUint8(40, bits);
+        raw.forEach((byte, i) => view.setUint8(41 + i, byte));
+        return { data: view.buffer };
+    };
+"""
+#: Two of them and a fingertip.
+SERVER = (
+    PARTS
+    + """
     const bare = { fingertip: true, period_ms: 1000, pads: [], position_m: [], normal: [],
                    radius_mm: [], area_mm2: [], triangles: [] };
-    const socket = window.sockets.at(-1);
     const say = (type, message) => socket.onmessage({ data: JSON.stringify({ type, ...message }) });
     window.contacts = (part, state, why = null, contacts = []) =>
         say("contacts", { part, state, why, contacts });
@@ -93,23 +113,12 @@ SERVER = """(() => {
         part, age_s, state: "ok", sentences: [], rate_hz: 50, taxels: 1, valid_taxels: 1,
         triangles: [],
     });
-    let seq = 0;
-    window.pressed = (number, age_s) => {
-        const view = new DataView(new ArrayBuffer(41));
-        view.setUint8(0, 1);
-        view.setUint16(2, number, true);
-        view.setUint32(4, 1, true);
-        view.setUint32(8, 9, true);
-        view.setUint32(12, ++seq, true);
-        view.setFloat64(16, seq / 20, true);
-        view.setFloat32(32, age_s, true);
-        view.setUint8(40, 1);
-        socket.onmessage({ data: view.buffer });
-    };
+    window.pressed = (number, age_s) => socket.onmessage(frameOf(9, number, age_s, 1));
     say("layout", { version: 9, robot: "three", nodes: {},
                     parts: [part("palm"), part("wrist"), part("tip", bare)] });
     return true;
 })()"""
+)
 TOUCHING = """document.getElementById("no-contacts").hidden
     ? "" : document.getElementById("no-contacts").textContent"""
 TOTAL = 'document.querySelector("#forces span").textContent'
@@ -306,12 +315,21 @@ async def test_stopped_data_are_called_stale_and_everything_comes_back(
         await seen.until(f"({CONTACTS}).length")
 
 
+@asynccontextmanager
+async def served(
+    mosquitto: Mosquitto, profile: Path, script: str = SERVER, width: int = 1280
+) -> AsyncIterator[Page]:
+    """The page, and what a script sends it in a server's place."""
+    async with viewing(mosquitto, "nobody", profile, width, watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        await seen.run(script)
+        yield seen
+
+
 async def test_nothing_touches_only_what_is_known_to_be_untouched(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
-    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.at(-1)?.readyState === 1")
-        await seen.run(SERVER)
+    async with served(mosquitto, tmp_path / "p") as seen:
 
         async def shows(text: str, total: str) -> None:
             await seen.until(f"{TOUCHING} === {json.dumps(text)} && {TOTAL} === 'total: {total}'")
@@ -361,9 +379,7 @@ async def test_of_a_robot_that_is_not_there_no_force_is_known(
 @asynccontextmanager
 async def untouched(mosquitto: Mosquitto, profile: Path) -> AsyncIterator[Page]:
     """The page of a skin whose frames, health and contacts come, and nothing touches."""
-    async with viewing(mosquitto, "nobody", profile, watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.at(-1)?.readyState === 1")
-        await seen.run(SERVER)
+    async with served(mosquitto, profile) as seen:
         await seen.run("setInterval(() => { pressed(0, 0); pressed(1, 0); health('tip', 0); }, 50)")
         await seen.run("contacts('palm', 'OFF'); contacts('wrist', 'OFF'); contacts('tip', 'OFF')")
         yield seen
@@ -479,10 +495,8 @@ async def test_of_a_part_without_frames_contacts_are_shown(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
     """Its configuration has `frames = false`: it was shown as one of which nothing comes."""
-    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.at(-1)?.readyState === 1")
-        silent = "part('palm', { frames: false })"
-        await seen.run(SERVER.replace("part('palm')", silent).replace('part("palm")', silent))
+    script = SERVER.replace('part("palm")', "part('palm', { frames: false })")
+    async with served(mosquitto, tmp_path / "p", script) as seen:
         await seen.run(
             "setInterval(() => { health('palm', 0); pressed(1, 0); health('tip', 0); }, 50)"
         )
@@ -510,9 +524,7 @@ async def test_raw_values_stay_while_any_node_sends_them(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
     """One that is offline, or takes no commands, is not asked; one may refuse."""
-    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.at(-1)?.readyState === 1")
-        await seen.run(SERVER)
+    async with served(mosquitto, tmp_path / "p") as seen:
         await seen.run("""(() => {
             window.asked = [];
             const socket = window.sockets.at(-1);
@@ -546,48 +558,28 @@ async def test_raw_values_stay_while_any_node_sends_them(
         await seen.until('document.getElementById("banner").textContent === "no"')
 
 
-#: Two parts of one taxel each, of a node that sends raw values; its byte, and its bits.
-RAW_SERVER = """(() => {
-    const socket = window.sockets.at(-1);
+#: Two of them, of a node that sends raw values: the byte of each, and its bits.
+RAW_SERVER = (
+    PARTS
+    + """
     socket.send = () => {};
     const take = socket.onmessage;
     // Of the server itself nothing comes any more.
     socket.onmessage = () => {};
     const say = message => take.call(socket, { data: JSON.stringify(message) });
-    const part = name => ({
-        name, node: "main", period_ms: 50, pads: ["pressure"], position_m: [[0, 0, 0]],
-        normal: [[0, 0, 1]], radius_mm: [2], area_mm2: [20], triangles: [
-            { board: "b", number: 0, kind: "x", first: 0, no_load: 240,
-              outline_m: [[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]] },
-        ],
-    });
     say({ type: "layout", version: 10, robot: "r", parts: [part("palm"), part("wrist")],
           nodes: { main: { commands: true } } });
     say({ type: "status", connected: true, commands: true, error: "", nodes: { main: true } });
-    let seq = 0;
-    window.bytes = (number, byte, bits) => {
-        const view = new DataView(new ArrayBuffer(42));
-        view.setUint8(0, 1);
-        view.setUint8(1, 1);
-        view.setUint16(2, number, true);
-        view.setUint32(4, 1, true);
-        view.setUint32(8, 10, true);
-        view.setUint32(12, ++seq, true);
-        view.setFloat64(16, seq / 20, true);
-        view.setUint8(40, bits);
-        view.setUint8(41, byte);
-        take.call(socket, { data: view.buffer });
-    };
+    window.bytes = (number, byte, bits) => take.call(socket, frameOf(10, number, 0, bits, byte));
 })()"""
+)
 
 
 async def test_a_byte_that_was_not_received_is_no_press(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
     """Frames hold 0 for it, which a pad that is pressed to the end of its scale sends, too."""
-    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.at(-1)?.readyState === 1")
-        await seen.run(RAW_SERVER)
+    async with served(mosquitto, tmp_path / "p", RAW_SERVER) as seen:
         await seen.run("setInterval(() => { bytes(0, 0, 0); bytes(1, 0, 1); }, 50)")
         await seen.run('document.getElementById("show-raw").click()')
         for key in (".", "Enter", ".", "Enter"):
@@ -608,9 +600,7 @@ async def test_a_byte_that_was_not_received_is_no_press(
 async def test_the_words_at_the_scale_of_raw_values_stand_apart(
     mosquitto: Mosquitto, tmp_path: Path, width: int
 ) -> None:
-    async with viewing(mosquitto, "nobody", tmp_path / "p", width, watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.at(-1)?.readyState === 1")
-        await seen.run(RAW_SERVER)
+    async with served(mosquitto, tmp_path / "p", RAW_SERVER, width) as seen:
         await seen.run("setInterval(() => { bytes(0, 230, 1); bytes(1, 239, 1); }, 50)")
         await seen.run('document.getElementById("show-raw").click()')
         await seen.until(f'{TICKS}[0] === "raw = no-load"')
@@ -623,9 +613,7 @@ async def test_the_words_at_the_scale_of_raw_values_stand_apart(
 async def test_what_is_at_the_cursor_stands_beside_it_under_a_banner(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
-    async with viewing(mosquitto, "nobody", tmp_path / "p", 400, watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.at(-1)?.readyState === 1")
-        await seen.run(RAW_SERVER)
+    async with served(mosquitto, tmp_path / "p", RAW_SERVER, 400) as seen:
         await seen.run("setInterval(() => { bytes(0, 230, 1); bytes(1, 230, 1); }, 50)")
         await seen.press(".")
         # How far below the name of its part it stands, on the map.
@@ -646,9 +634,7 @@ async def test_what_is_at_the_cursor_stands_beside_it_under_a_banner(
 async def test_what_is_old_when_the_page_opens_is_not_shown_as_present(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
-    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.at(-1)?.readyState === 1")
-        await seen.run(SERVER)
+    async with served(mosquitto, tmp_path / "p") as seen:
         # In the first picture that is drawn of it.
         palm, wrist, tip = await seen.run("""(() => {
             pressed(0, 3000); health('palm', 3000); health('tip', 3000);
@@ -700,9 +686,7 @@ async def test_what_the_broker_had_stored_shows_no_part_as_well(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
     """A robot that was switched off has left its last health there."""
-    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.at(-1)?.readyState === 1")
-        await seen.run(SERVER)
+    async with served(mosquitto, tmp_path / "p") as seen:
         await seen.run("health('tip', null); health('palm', null); pressed(0, 0)")
         states = """JSON.stringify(['palm', 'tip'].map(part => document.querySelector(
             `#health article[data-part="${part}"] h3`)?.innerText.split("\\n").at(-1)))"""
