@@ -57,6 +57,12 @@ _EXACT_S = 1 << 32
 _LINE = re.compile(
     rb"\((\d{1,10})\.(\d{6})\) ([!-~]+) ([0-9A-Fa-f]{3})#((?:[0-9A-Fa-f]{2}){0,8})\Z"
 )
+#: Python's numbers, with which python-can reads a line, may have signs and underscores, and what
+#: stands in place of the brackets around the time is not looked at.
+_ANY_LINE = re.compile(
+    rb"\s*\([0-9.]+\)\s+[!-~]+\s+[0-9A-Fa-f]{1,8}"
+    rb"#(?:R[0-9A-Fa-f]?|(?:#[0-9A-Fa-f])?(?:[0-9A-Fa-f]{2})*)(?:\s+[RTrt])?\s*\Z"
+)
 #: Candump writes error frames with a flag in the identifier, which python-can reads as that of an
 #: extended data frame, or, of errors on the bus, without the identifier and the data.
 _ERROR_LINE = re.compile(rb"(\s*\S+\s+\S+\s+)([23])(?=[0-9A-Fa-f]{7}#)")
@@ -335,13 +341,13 @@ def _decode_one(
     if error is not None:
         line = b"%b%d%b" % (error[1], int(error[2]) - 2, line[error.end() :])
     try:
-        messages = list(can.CanutilsLogReader(io.StringIO(line.decode(), newline=None)))
+        if line.strip() and _ANY_LINE.match(line) is None:
+            raise ValueError
+        messages = list(can.CanutilsLogReader(io.StringIO(line.decode())))
     except Exception:  # python-can has many kinds of errors for a damaged line
         shown = visible(seen.decode(errors="replace"), _SHOWN)
         raise DamageError(f'seen "{shown}", wanted {_WANTED}') from None
     for message in messages:
-        if rows.kind[row] != _EMPTY:
-            raise DamageError("several messages in one line")
         rows.kind[row] = _NO_FRAME
         try:
             converted = convert(message)

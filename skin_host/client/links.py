@@ -188,8 +188,8 @@ async def only_robot(connection: Connection, broker: Broker, base: str) -> str:
     Of several the only one that is online: the broker remembers who has left.
 
     Raises:
-        RequestError: there is none, or more than one.
-        BrokerError: it does not let us know which there are.
+        BrokerError: there is none, or it does not let us know which there are.
+        RequestError: there is more than one.
     """
     prefix = f"{base}/"
     # By topic: of two statuses of a node the later one is true.
@@ -208,7 +208,7 @@ async def only_robot(connection: Connection, broker: Broker, base: str) -> str:
     known = set(robots.values())
     meant = {robots[topic] for topic, status in statuses.items() if status == ONLINE} or known
     if not meant:
-        raise RequestError(
+        raise BrokerError(
             f'broker {broker}: no robot has published below "{base}"; is `skin run` running?'
         )
     if len(meant) > 1:

@@ -322,7 +322,8 @@ class SkinClient:
         with self._requests.request(name, arguments) as request:
             try:
                 async with asyncio.timeout(timeout_s):
-                    node = node or await self._only_node()
+                    known = await self._nodes_of_command(node)
+                    node = node or self._only(known)
                     self._refuse_deaf(node)
                     self._refuse_unread(lambda subscriptions: {subscriptions.replies})
                     await self._ask(node, name, request.payload)
@@ -496,12 +497,35 @@ class SkinClient:
             if why is not None:
                 stream.fail(why)
 
-    async def _only_node(self) -> str:
+    async def _nodes_of_command(self, wanted: str | None) -> list[str]:
+        """Return the robot's nodes once those that the broker keeps are known, or, if it is known
+        before, once the wanted one is.
+
+        Raises:
+            RequestError: none of them is the wanted one.
+        """
         await self._until(lambda: self.connected)
-        # By then all retained messages have been received: there are no more nodes than these.
-        age_s = _now_s() - max(link.since_s for link in self._links)
-        await asyncio.sleep(max(0.0, RETAINED_S - age_s))
-        known = sorted(name for name, node in self.nodes.items() if node.online is not False)
+        if wanted not in self.nodes:
+            # By then all retained messages have been received: there are no more nodes than these.
+            age_s = _now_s() - max(link.since_s for link in self._links)
+            await asyncio.sleep(max(0.0, RETAINED_S - age_s))
+        known = sorted(self.nodes)
+        # A broker may keep nothing, or let us read nothing of it, and hand on commands.
+        if wanted is not None and known and wanted not in known:
+            raise RequestError(
+                f'robot "{self.robot}": it has no node "{wanted}"; wanted one of: '
+                f"{', '.join(known)}"
+            )
+        return known
+
+    def _only(self, known: list[str]) -> str:
+        """Return the node of these that is online.
+
+        Raises:
+            BrokerError: there is none.
+            RequestError: there are several.
+        """
+        known = [name for name in known if self.nodes[name].online is not False]
         online = [name for name in known if self.nodes[name].online] or known
         if len(online) == 1:
             return online[0]

@@ -535,7 +535,8 @@ def fit_curves(
     joined = curves if kept is None else _joined(kept, curves, renewed)
     calibration = _renewed(samples, before, pressed, gain, bend, joined)
     is_kept = memory is not None
-    known = is_kept or unloads(steady)
+    # Without plays the one before was none, or not known.
+    known = (is_kept and bool(curves.memory.radius_kpa)) or unloads(steady)
     return Fitted(calibration, curves, pressed, ratio, pressed & ~renewed, known, is_kept)
 
 

@@ -259,13 +259,36 @@ def test_frames_of_can_fd_are_passed_over(tmp_path):
     assert batch.id.tolist() == [0x4E0, 0x4E2]
 
 
-@pytest.mark.parametrize(
-    ("written", "seen"),
-    [("99999999999999.0", "1e+14"), ("inf", "inf"), ("1e400", "inf"), ("nan", "nan")],
-)
+@pytest.mark.parametrize(("written", "seen"), [("99999999999999.0", "1e+14"), ("9" * 400, "inf")])
 def test_a_time_that_no_clock_shows_ends_a_recording(tmp_path, written: str, seen: str):
     far = candump(tmp_path / "far.log", ["(1.0) can0 4E0#40", f"({written}) can0 4E0#40"])
     assert f"damaged after frame 1: line 2: a time of {seen} s" in message_of(far)
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        "00000) can0 4E0#40",
+        "(1_7) can0 4E0#40",
+        "(1e1) can0 4E0#40",
+        "(inf) can0 4E0#40",
+        "(nan) can0 4E0#40",
+        "(2.0) can0 4_0#40",
+        "(2.0) can0 4E0#+4",
+        "(2.0) can0 4E0#4",
+        "(2.0) can0 4E0#40\r(3.0) can0 4E0#40",
+    ],
+)
+def test_what_candump_does_not_write_ends_a_recording(tmp_path, damaged: str):
+    """A first line that was cut in its time counted as time 0."""
+    path = candump(tmp_path / "odd.log", ["(1.0) can0 4E0#40", damaged])
+    assert "damaged after frame 1: line 2: seen" in message_of(path)
+
+
+def test_every_form_of_candump_is_read(tmp_path):
+    lines = ["(1) 0 1#", "(1.) can0 4E0#R", "(1.5) can0 4E0#R8", "(2.0) can0 1234567#4041 R", "\t"]
+    ids = [each for batch in read(candump(tmp_path / "forms.log", lines)) for each in batch.id]
+    assert ids == [0x1, 0x400004E0, 0x400004E0, 0x81234567]
 
 
 BLANK = st.lists(st.sampled_from([b"\n", b"\r\n"]), max_size=4).map(b"".join)

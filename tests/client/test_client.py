@@ -415,8 +415,16 @@ async def test_a_command_that_fails_says_why(mosquitto: Mosquitto) -> None:
         with pytest.raises(CommandError, match='no answer to "sleep" from node "main"') as failed:
             await skin.command("sleep", node="main", timeout_s=0.2)
         assert "within 0.2 s; it may still be carried out" in str(failed.value)
-        with pytest.raises(CommandError, match='node "other"'):
-            await skin.command("calibrate", node="other", timeout_s=0.2)
+        with pytest.raises(RequestError, match='it has no node "other"; wanted one of: main'):
+            await skin.command("calibrate", node="other", timeout_s=10 * PATIENCE_S)
+
+
+async def test_a_command_goes_to_a_node_of_which_the_broker_keeps_nothing(
+    mosquitto: Mosquitto,
+) -> None:
+    async with hearing(mosquitto) as skin:
+        with pytest.raises(CommandError, match='no answer to "calibrate" from node "main"'):
+            await skin.command("calibrate", node="main", timeout_s=PATIENCE_S)
 
 
 @pytest.mark.parametrize(
@@ -532,7 +540,7 @@ async def test_a_command_to_one_of_two_nodes_names_it(mosquitto: Mosquitto) -> N
 
 
 async def test_the_only_robot_of_a_broker_needs_no_name(mosquitto: Mosquitto) -> None:
-    with pytest.raises(RequestError, match="is `skin run` running"):
+    with pytest.raises(BrokerError, match="is `skin run` running"):
         async with hearing(mosquitto, None):
             pass
     async with publishing(mosquitto, "nao"):
@@ -618,7 +626,7 @@ async def test_without_a_broker_the_error_says_so() -> None:
 async def test_a_broker_without_robots_is_not_taken_for_one_that_does_not_answer(
     mosquitto: Mosquitto,
 ) -> None:
-    with pytest.raises(RequestError, match="no robot has published"):
+    with pytest.raises(BrokerError, match="no robot has published"):
         async with hearing(mosquitto, robot=None, patience_s=0.3):
             pass
 

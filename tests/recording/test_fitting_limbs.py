@@ -20,6 +20,7 @@ from skin_host.processing.curves import CurveVerdict, Memory
 from tests.support.limbs import (
     ARM,
     BOARDS,
+    HZ,
     LEG,
     PADS,
     calibrate,
@@ -137,6 +138,21 @@ def test_what_keeps_its_curves_keeps_the_hysteresis_of_the_foam_with_them(
     found = stored(bench, kept).curves
     assert found is not None
     assert found.memory != foam
+
+
+def test_a_hysteresis_that_was_not_known_is_not_kept_as_none(
+    bench: Path, kept: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    units, table = ramp(bench)
+    rising = units[: round(48.0 * HZ)]
+    assert calibrate(bench, write_log(bench.with_name("both.log"), rising), table) == 0
+    arm = write_log(bench.with_name("arm.log"), pressed(rising, ARM))
+    capsys.readouterr()
+    assert calibrate(bench, arm, table) == 0
+    answer = capsys.readouterr()
+    assert f"hysteresis of the foam: not known, kept from {kept} with curves" in answer.out
+    assert "expected error of the good while loading" in answer.out
+    assert "pressures that go down read too high" in answer.err
 
 
 def test_pads_of_a_pressed_board_that_do_not_move_are_dead(bench: Path, kept: Path) -> None:
