@@ -226,7 +226,7 @@ def _numbers(text: str) -> list[int]:
 
 def _record(arguments: argparse.Namespace) -> int:
     from skin_host.recording import is_mcap
-    from skin_host.recording.capture import CanLog
+    from skin_host.recording.capture import CanLog, can_suffix
     from skin_host.recording.mcap import Recorder
 
     file: Path = arguments.file
@@ -239,6 +239,7 @@ def _record(arguments: argparse.Namespace) -> int:
                 _require_frames(arguments, 0)
         told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
     else:
+        can_suffix(file)
         if arguments.config is None or arguments.broker is not None:
             raise RequestError(f"{file}: holds CAN frames alone and needs --config; or use .mcap")
         settings, _ = load_skin(arguments.config)

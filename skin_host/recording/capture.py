@@ -91,6 +91,19 @@ def message_at(batch: FrameBatch, row: int, channel: str | None = None) -> can.M
     )
 
 
+def can_suffix(path: Path) -> str:
+    """Return the suffix of a file that is to hold CAN frames, one of `CAN_SUFFIXES`.
+
+    Raises:
+        RequestError: it has another one.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in CAN_SUFFIXES:
+        known = ", ".join([*CAN_SUFFIXES, MCAP_SUFFIX])
+        raise RequestError(f'{path}: suffix "{path.suffix}"; wanted one of {known}')
+    return suffix
+
+
 class CanLog:
     """CAN frames in a format of python-can; the file gets its name when it is closed.
 
@@ -110,10 +123,7 @@ class CanLog:
     """
 
     def __init__(self, path: Path, channels: Collection[str] = ()) -> None:
-        suffix = path.suffix.lower()
-        if suffix not in CAN_SUFFIXES:
-            known = ", ".join([*CAN_SUFFIXES, MCAP_SUFFIX])
-            raise RequestError(f'{path}: suffix "{path.suffix}"; wanted one of {known}')
+        suffix = can_suffix(path)
         if len({name_in(path, channel) for channel in channels}) < len(channels):
             raise RequestError(
                 f"{path}: channels {', '.join(channels)} are the same in this format; "

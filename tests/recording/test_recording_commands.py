@@ -109,6 +109,7 @@ def test_a_recording_opens_with_the_mcap_reader_and_replays_to_the_same_bytes(
         (["export", "gone.mcap", "a.npz"], "skin export: gone.mcap: cannot be read: No such file"),
         (["plot", "calibration", "a.json", "a.png"], "skin plot: a calibration is drawn with"),
         (["record", "a.log"], "skin record: a.log: holds CAN frames alone and needs --config"),
+        (["record", "a.txt"], 'skin record: a.txt: suffix ".txt"; wanted one of .log'),
         (["record", "setup.cfg"], "skin record: setup.cfg: is there already"),
         (["replay", "a.log"], "skin replay: the following arguments are required: --config"),
         (["replay", "a.log", "--onto", "can"], "skin replay: --onto can needs --config"),
