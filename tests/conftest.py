@@ -27,7 +27,7 @@ LONGEST_FIRST = (
     "tests/processing/test_long_contact.py",
     "tests/attacks/test_hostile_bus.py",
     "tests/cli/test_running_commands.py",
-    "tests/recording/test_fitting.py",
+    "tests/recording/fitting/test_holds_and_levels.py",
     "tests/evaluation/simulate/test_truth.py",
     "tests/mqtt/test_rejected.py",
     "tests/docs/test_pages.py",

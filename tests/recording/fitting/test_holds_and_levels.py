@@ -17,7 +17,7 @@ from skin_host.evaluation.histories import record
 from skin_host.layout import build_layout
 from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.pressure import PressureCurve
-from skin_host.recording.fitting import plateaus
+from skin_host.recording.fitting.levels import plateaus
 from tests.support.limbs import without
 
 HZ = 5.0
