@@ -10,11 +10,11 @@ from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
 from skin_host.client.absent import no_such_part, unpublished
-from skin_host.client.heard import Described, Health, is_online, read
+from skin_host.client.heard import Described, Health
+from skin_host.client.intake import Intake
 from skin_host.client.links import RETAINED_S, ROBOT_S, BrokerLink, only_robot, refusal
-from skin_host.client.nodes import MAX_NAMES, Node, Nodes
-from skin_host.client.order import EventOrder, Newest
-from skin_host.client.presence import STALE_S, Contact, Presence
+from skin_host.client.nodes import Node
+from skin_host.client.presence import STALE_S, Contact
 from skin_host.client.requests import (
     CommandError,
     Request,
@@ -24,10 +24,9 @@ from skin_host.client.requests import (
 )
 from skin_host.client.streams import Kind, Stream, refuse_other_loop
 from skin_host.client.subscriptions import Subscriptions
-from skin_host.errors import BrokerError, RequestError, SkinError, visible
+from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.commands import decode_result
 from skin_host.mqtt.connection import (
     Connection,
     Message,
@@ -37,20 +36,14 @@ from skin_host.mqtt.connection import (
 )
 from skin_host.mqtt.info import NodeInfo
 from skin_host.mqtt.messages import Frame
-from skin_host.mqtt.order import parts_of, run_of, stamp_of
-from skin_host.mqtt.payload import JSON_TYPE, MessageError
-from skin_host.mqtt.topics import NAME, WRONG_NAME, PartTopic, Topics, wrong_part
+from skin_host.mqtt.payload import JSON_TYPE
+from skin_host.mqtt.topics import Topics, wrong_part
 from skin_host.processing.events import Touch
 from skin_host.tasks import cancel
 
-#: An event waits this long for an earlier one, which may come from another broker: as long as a
-#: robot sends events again there (`mqtt.outbox.REPEAT_S`). Only after an earlier one is missing.
-HOLD_S = 10.0
 #: Daemons find a broker that starts, or that comes back, within 3 s. This long after the last of
 #: them has named its parts there are no others.
 NAMED_S = 5.0
-#: No more reasons why messages are unreadable are logged.
-MOST_REASONS = 20
 #: Health comes once a second, and may come late: nothing could be called stale sooner.
 LEAST_STALE_S = 1.5
 #: Timeouts are checked this often.
@@ -134,13 +127,8 @@ class SkinClient:
         self._identifier = f"skin-client-{secrets.token_hex(4)}"
         self._requests = Requests(self._identifier)
         self._streams: WeakSet[Stream[Any]] = WeakSet()
-        self._latest: dict[str, Health] = {}
-        #: Names that were received: of parts, and of nodes.
-        self._names: tuple[set[str], set[str]] = (set(), set())
-        self._presence = Presence(stale_s)
-        self._nodes = Nodes(self._presence)
-        self._order = EventOrder(HOLD_S if len(brokers) > 1 else 0.0)
-        self._newest = Newest()
+        self._intake = Intake(self._streams, self._requests, stale_s, len(brokers))
+        self._presence, self._nodes = self._intake.presence, self._intake.nodes
         self._news = asyncio.Event()
         #: In which the client was entered.
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -154,8 +142,6 @@ class SkinClient:
         #: None until the robot's name is known.
         self._subscriptions = None if robot is None else self._subscriptions_of(robot)
         self.last_error = ""
-        self.unreadable = 0
-        self._unreadable_for: set[str] = set()
 
     def _subscriptions_of(self, robot: str) -> Subscriptions:
         topics = Topics(self._base, robot)
@@ -183,6 +169,11 @@ class SkinClient:
     def connections(self) -> int:
         """How often a broker was found."""
         return sum(link.connections for link in self._links)
+
+    @property
+    def unreadable(self) -> int:
+        """How many messages could not be read."""
+        return self._intake.unreadable
 
     def touches(self, part: str | None = None) -> Stream[Touch]:
         """Touch events of a part, or of all."""
@@ -452,18 +443,7 @@ class SkinClient:
         stream: Stream[Any] = Stream(part, *kinds)
         stream.loop = self._loop
         self._streams.add(stream)
-        if "health" in kinds:
-            for name, health in self._latest.items():
-                if part in (None, name):
-                    stream.put(health)
-        if "contact" in kinds:
-            for contact in self._presence.reported():
-                if part in (None, contact.part):
-                    stream.put(contact)
-        if "info" in kinds:
-            for described in self._nodes.described():
-                if part in (None, described.part):
-                    stream.put(described)
+        self._intake.begin(stream)
         self._ask_again()
         return stream
 
@@ -571,7 +551,7 @@ class SkinClient:
         for stream in self._streams:
             for topic in self._subscriptions.required(stream) & link.refused:
                 stream.refuse(topic, refusal(link.broker, topic))
-        for part in self._names[False]:
+        for part in self._intake.parts:
             if link.refused & self._subscriptions.of("contact", part):
                 self._presence.take_refusal(part, link.number)
 
@@ -595,28 +575,14 @@ class SkinClient:
             self._presence.take_loss(link.number)
         self._note_refusals(link)
         if not self._stopping:
-            self._report_contacts()
-            self._nodes.watch(_now_s())
+            self._intake.look()
         self._news.set()
 
     def unfollow(self, topic: str) -> None:
-        """Forget the states of parts that are not followed any more, neither by another topic."""
         assert self._subscriptions is not None
         place = self._subscriptions.topics.parse(topic)
-        kind = None if place is None else place.kind
-        if kind not in ("contact", "health", "touch"):
-            return
-        for part in self._names[False]:
-            if kind in self._subscriptions.kinds_of(part):
-                continue
-            if kind == "touch":
-                self._presence.forget_touches(part)
-                continue
-            if kind == "health":
-                self._latest.pop(part, None)
-            else:
-                self._presence.forget_state(part)
-            self._newest.forget(kind, part)
+        if place is not None:
+            self._intake.forget(place.kind, self._subscriptions.kinds_of)
 
     def wanted(self) -> Iterable[str]:
         return () if self._subscriptions is None else self._subscriptions.wanted()
@@ -624,184 +590,18 @@ class SkinClient:
     def take(self, link: BrokerLink, message: Message) -> None:
         assert self._subscriptions is not None
         place = self._subscriptions.topics.parse(message.topic.value)
-        payload = message.payload if isinstance(message.payload, bytes) else b""
         if place is None:
             return
-        kind, name, piece = place
-        try:
-            if kind != "answer":
-                self._admit(kind in ("status", "info"), name)
-            if kind == "status":
-                self._take_status(name, payload, link, message)
-            elif kind == "info":
-                if self._newness(kind, f"{name}/{piece}", message) is not False:
-                    stamp = stamp_of(message.properties)
-                    self._nodes.take_info(name, piece, payload, stamp, _now_s())
-                    self._report_nodes()
-            elif kind == "answer":
-                if self._requests.take(decode_result(payload)):
-                    self._news.set()
-            else:
-                self._take_part(kind, name, payload, link, message)
-        except SkinError as error:
-            self._note_unreadable(message.topic.value, error)
-            if not isinstance(error, MessageError):  # it is we who cannot read it
-                for stream in self._streams:
-                    if kind in stream.kinds and stream.part in (None, name):
-                        stream.refuse(kind, error)
-
-    def _note_unreadable(self, topic: str, error: SkinError) -> None:
-        """Count a message that cannot be read; log each reason once, and no more than some."""
-        self.unreadable += 1
-        why = visible(str(error))
-        if why not in self._unreadable_for and len(self._unreadable_for) < MOST_REASONS:
-            self._unreadable_for.add(why)
-            _log.warning("%s: %s; such messages are passed over", visible(topic), why)
-
-    def _admit(self, is_node: bool, name: str) -> None:
-        """Remember a name, so that what is known of names stays bounded: anybody may publish.
-
-        Raises:
-            MessageError: no configuration has such a name, or there are too many.
-        """
-        names = self._names[is_node]
-        if name not in names:
-            if not NAME.fullmatch(name):
-                raise MessageError(WRONG_NAME)
-            if len(names) >= MAX_NAMES:
-                what = "nodes" if is_node else "parts"
-                raise MessageError(f"more than {MAX_NAMES} {what} of one robot")
-            names.add(name)
-
-    def _newness(self, kind: str, name: str, message: Message) -> bool | None:
-        """Return whether a retained message is newer than the known one; None: the same again."""
-        if len(self._links) == 1:
-            return True
-        if not message.payload:
-            self._newest.forget(kind, name)
-            return True
-        # Nodes and their infos are not published again and again.
-        is_live = kind in ("contact", "health") and not message.retain
-        live_s = _now_s() if is_live else None
-        return self._newest.take(kind, name, stamp_of(message.properties), live_s)
-
-    def _take_status(self, name: str, payload: bytes, link: BrokerLink, message: Message) -> None:
-        newness = self._newness("status", name, message)
-        if newness is False:
-            return
-        online = is_online(
-            payload, stamp_of(message.properties), is_only_broker=len(self._links) == 1
-        )
-        self._nodes.take_status(
-            name,
-            online,
-            _now_s(),
-            link.number,
-            again=newness is None,
-            parts=parts_of(message.properties),
-            deleted=not payload,
-        )
-        self._nodes.watch(_now_s())
-        self._report_nodes()
-
-    def _report_nodes(self) -> None:
-        """Pass on what a status or an info has changed."""
-        for described in self._nodes.changes():
-            for stream in self._streams:
-                if "info" in stream.kinds and stream.part in (None, described.part):
-                    stream.put(described)
-        self._report_contacts()
-        self._news.set()
-
-    def _take_part(
-        self, kind: PartTopic, part: str, payload: bytes, link: BrokerLink, message: Message
-    ) -> None:
-        assert self._subscriptions is not None
-        if kind not in self._subscriptions.kinds_of(part):
-            self._ask_again()  # nobody reads it any more
-            return
-        item = read(kind, part, payload, stored=message.retain)
-        now_s = _now_s()
-        if isinstance(item, Touch | Slip | Over):
-            run = run_of(message.properties)
-            before = self._order.run_of(item)
-            for event in self._order.take(item, run, now_s):
-                # What had to wait for its turn may be of the run before.
-                self._pass_on(event, run if event.t_ns == item.t_ns else before)
-        elif isinstance(item, Frame):
-            run = run_of(message.properties)
-            if self._order.take_frame(item, run, now_s):
-                self._presence.take_sign(part, now_s)
-                self._put(kind, item, run)
-        elif kind == "contact":
-            assert item is None or isinstance(item, Contact)
-            newness = self._newness(kind, part, message)
-            if newness is not False:
-                self._presence.take_state(
-                    part,
-                    None if item is None else item.state,
-                    now_s,
-                    link.number,
-                    again=newness is None,
-                    stored=message.retain,
-                    sent_s=_sent_s(message),
-                    connection=self._connection_of(message),
-                )
-        elif self._newness(kind, part, message):
-            if item is None:
-                self._latest.pop(part, None)
-            else:
-                assert isinstance(item, Health)
-                if not item.stored:
-                    sent_s, connection = _sent_s(message), self._connection_of(message)
-                    self._presence.take_sign(part, now_s, sent_s, connection)
-                self._latest[part] = item._replace(stored=True)
-                self._put(kind, item)
-        self._report_contacts()
-
-    def _connection_of(self, message: Message) -> int | None:
-        """Return the connection of the node over which a message was sent; None: not known, or it
-        shows nothing.
-
-        Over several brokers the messages of a connection do not come after those of the last one: a
-        broker that is held up may be the next one that the node turned to.
-        """
-        stamp = stamp_of(message.properties)
-        return None if stamp is None or len(self._links) > 1 else stamp.connection
-
-    def _pass_on(self, event: Touch | Slip | Over, run: int | None) -> None:
-        kind: PartTopic = "touch"
-        if isinstance(event, Touch):
-            self._presence.take_touch(event, _now_s(), run)
-        else:
-            kind = "slip" if isinstance(event, Slip) else "over"
-            self._presence.take_sign(event.part, _now_s())
-        self._put(kind, event, run)
-
-    def _put(
-        self,
-        kind: PartTopic,
-        item: Touch | Slip | Over | Frame | Health,
-        run: int | None = None,
-    ) -> None:
-        for stream in self._streams:
-            if kind in stream.kinds and stream.part in (None, item.part):
-                stream.put(item, run)
-
-    def _report_contacts(self) -> None:
-        for contact in self._presence.changes(_now_s()):
-            for stream in self._streams:
-                if "contact" in stream.kinds and stream.part in (None, contact.part):
-                    stream.put(contact)
+        if not self._intake.take(place, message, link.number, self._subscriptions.kinds_of):
+            self._ask_again()
+        if place.kind in ("status", "info", "answer"):
+            self._news.set()
 
     async def _watch(self) -> None:
         """Detect timeouts."""
         while True:
             await asyncio.sleep(WATCH_S)
-            for event in self._order.expire(_now_s()):
-                self._pass_on(event, self._order.run_of(event))
-            self._report_contacts()
-            self._nodes.watch(_now_s())
+            self._intake.expire()
             self._check_parts(_now_s())
 
 
@@ -823,12 +623,6 @@ def _check_times(**times_s: float) -> None:
     for name, time_s in times_s.items():
         if not time_s >= 0:
             raise RequestError(f"{name}: seen {time_s}, wanted seconds from 0 on")
-
-
-def _sent_s(message: Message) -> float | None:
-    """When a state was published, by the node's clock; None: it was stored, or does not show."""
-    stamp = None if message.retain else stamp_of(message.properties)
-    return None if stamp is None else stamp.sent_s
 
 
 def _now_s() -> float:

@@ -36,10 +36,10 @@ import msgspec
 import numpy as np
 
 from skin_host.client.heard import is_online
+from skin_host.client.intake import HOLD_S
 from skin_host.client.links import BrokerLink
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import STALE_S, Presence
-from skin_host.client.session import HOLD_S
 from skin_host.config.settings import Mqtt
 from skin_host.errors import RequestError
 from skin_host.evaluation.fleet_sockets import Heard, PlainEar, PlainRobot

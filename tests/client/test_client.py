@@ -279,7 +279,7 @@ async def test_a_stream_that_ended_while_the_link_was_cut_is_given_up(
         del frames
         await until(lambda: skin.connections == 2)
         received: list[Any] = []
-        skin._take_part = lambda kind, *_, **__: received.append(kind)  # type: ignore[method-assign]
+        skin._intake._take_part = lambda kind, *_, **__: received.append(kind)  # type: ignore[method-assign]
         publisher.put_frame(frame(1))
         await until(lambda: publisher.counters.frames_sent)
         publisher.put_touch(touch(1))
