@@ -59,8 +59,12 @@ def real_skin(document: Report) -> Section:
                 "60 kPa, the press that every pad must detect. `all calibrated`: the same share of "
                 "all valid readings of all pads that the calibration keeps, so of those, too, that "
                 "are valid for less than half of the recording, and may be wrong whenever they "
-                "are. Pressures are paired with sweeps by index, as the data's authors do; the "
-                "last columns have one lag fitted to the whole file."
+                "are. Pressures are paired with sweeps by index, as the data's authors do; beside "
+                "that with one lag fitted to the whole file, and with a lag and a rate: by "
+                "how much the pressure's clock, which is not recorded, is faster than that of the "
+                "sweeps. What the rate takes off is an error of the pairing. Curves that were "
+                "fitted with it read no better, because what it shifts in the loading and in the "
+                "unloading cancels."
             ),
             *remarks_on_real(document),
             (

@@ -64,6 +64,8 @@ FAR_KPA = LEVELS_KPA[0]
 SPIKE_SAMPLES = 5
 #: How far sweeps and pressures may be apart where one lag is fitted to a whole file.
 LARGEST_LAG_S = 3.0
+#: By which shares the pressure's clock may be faster, where its rate is fitted as well.
+RATES = np.arange(-20, 21) * 1e-3
 #: A quick report measures these, where they are.
 QUICK = ("left_calibration", "left_validation_1")
 GRASPS_UNTOUCHED_S = 6.0
@@ -416,7 +418,9 @@ def detected(
 def pressure_errors(
     recording: InsoleRecording, course: PlayedCourse, usable: Mask, why_not: str | None
 ) -> Row:
-    """Errors in kPa over the whole recording, paired by index; with one lag beside them."""
+    """Errors in kPa over the whole recording, paired by index; beside them with one lag, and with
+    one lag and one rate of the pressure's clock.
+    """
     row: Row = dict.fromkeys(
         (
             "median_rmse_kpa",
@@ -429,6 +433,10 @@ def pressure_errors(
             "lagged_median_rmse_kpa",
             "lagged_p95_rmse_kpa",
             "lagged_skin_rms_kpa",
+            "rate",
+            "rated_median_rmse_kpa",
+            "rated_p95_rmse_kpa",
+            "rated_skin_rms_kpa",
             "zero_kpa",
             "hindsight",
         )
@@ -445,28 +453,43 @@ def pressure_errors(
     sweep = course.sweep[paired]
     period_s = float(np.median(np.diff(recording.t_ns))) * 1e-9
 
-    def true_kpa(lag: int) -> Floats:
-        at = np.clip(sweep - lag, 0, len(recording.pressure_kpa) - 1)
-        return recording.pressure_kpa[at]
+    since_middle = sweep - sweep.mean()
 
-    def of_mean(lag: int) -> float:
-        return float(np.sqrt(np.mean((mean_kpa - true_kpa(lag)[known]) ** 2)))
+    def true_kpa(lag: int, rate: float = 0.0) -> Floats:
+        at = np.rint(sweep + rate * since_middle).astype(np.int64) - lag
+        true: Floats = recording.pressure_kpa[at.clip(0, len(recording.pressure_kpa) - 1)]
+        return true
 
-    def of_each(lag: int) -> Floats:
-        squares = (kpa - true_kpa(lag)[:, np.newaxis]) ** 2
+    def of_mean(lag: int, rate: float = 0.0) -> float:
+        return float(np.sqrt(np.mean((mean_kpa - true_kpa(lag, rate)[known]) ** 2)))
+
+    def of_each(lag: int, rate: float = 0.0) -> Floats:
+        squares = (kpa - true_kpa(lag, rate)[:, np.newaxis]) ** 2
         each: Floats = np.sum(squares, axis=0, where=valid)[count > 0] / count[count > 0]
         return np.sqrt(each)
 
-    def errors(lag: int) -> tuple[float, float, float]:
-        each = of_each(lag)
-        return float(np.median(each)), float(np.percentile(each, 95.0)), of_mean(lag)
+    def errors(lag: int, rate: float = 0.0) -> tuple[float, float, float]:
+        each = of_each(lag, rate)
+        return float(np.median(each)), float(np.percentile(each, 95.0)), of_mean(lag, rate)
 
     furthest = round(LARGEST_LAG_S / period_s)
-    lag = min(range(-furthest, furthest + 1), key=of_mean)
+    lags = range(-furthest, furthest + 1)
+    lag = min(lags, key=of_mean)
+    clocks = ((late, rate) for late in lags[::5] for rate in RATES[::4].tolist())
+    nearly_late, nearly = min(clocks, key=lambda clock: of_mean(*clock))
+    clocks = (
+        (late, rate)
+        for late in lags
+        for rate in RATES.tolist()
+        if abs(late - nearly_late) <= 5 and abs(rate - nearly) <= 4e-3
+    )
+    rated_lag, rate = min(clocks, key=lambda clock: of_mean(*clock))
     names = ("median_rmse_kpa", "p95_rmse_kpa", "skin_rms_kpa")
     row |= dict(zip(names, errors(0), strict=True))
     row |= {f"lagged_{name}": value for name, value in zip(names, errors(lag), strict=True)}
-    row["lag_s"] = lag * period_s
+    row |= {"lag_s": lag * period_s, "rate": rate}
+    rated = errors(rated_lag, rate)
+    row |= {f"rated_{name}": value for name, value in zip(names, rated, strict=True)}
     row["worst_rmse_kpa"] = float(of_each(0).max())
     row["far_share"] = far_share(recording, course, usable)
     here = valid.any(axis=0)

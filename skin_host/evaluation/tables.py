@@ -34,6 +34,7 @@ def real(document: Report) -> Table:
     head += ["begins a pad", "touched 10 s after", "median kPa", "95 % kPa", "mean of the skin kPa"]
     head += ["worst pad kPa", "off by 60 kPa", "valid", "off by 60 kPa, all calibrated"]
     head += ["lag s", "with it: median", "95 %", "mean"]
+    head += ["rate", "with both: median", "95 %", "mean"]
     rows = [
         [
             row["recording"],
@@ -51,6 +52,8 @@ def real(document: Report) -> Table:
             _number(row["calibrated_far_share"], "{:.2%}"),
             _number(row["lag_s"], "{:.2f}"),
             *(_number(row[f"lagged_{name}"], "{:.1f}") for name in ERRORS_KPA),
+            _number(row["rate"], "{:+.1%}"),
+            *(_number(row[f"rated_{name}"], "{:.1f}") for name in ERRORS_KPA),
         ]
         for row in document["real"]
     ]

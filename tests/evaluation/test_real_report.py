@@ -173,6 +173,18 @@ def test_right_pressures_have_no_error_and_late_ones_the_lag_that_was_put_in() -
     assert row["lagged_median_rmse_kpa"] < 1e-4
 
 
+@pytest.mark.parametrize("rate", [-0.015, 0.007])
+def test_the_rate_of_the_pressures_clock_is_found_beside_its_lag(rate: float) -> None:
+    made = recording(ramp())
+    everyone = np.ones(PADS, np.bool_)
+    middle = (len(made.t_ns) - 1) / 2
+    at = middle + (1.0 + rate) * (np.arange(len(made.t_ns)) - middle) - 25
+    reported = np.interp(at, np.arange(len(made.t_ns)), made.pressure_kpa)
+    row = real.pressure_errors(made, course(made, reported), everyone, None)
+    assert row["rate"] == pytest.approx(rate, abs=1.5e-3)
+    assert row["lagged_skin_rms_kpa"] > 3.0 * row["rated_skin_rms_kpa"]
+
+
 def test_a_pad_is_judged_by_the_frames_in_which_it_is_valid() -> None:
     made = recording(ramp())
     given = course(made, made.pressure_kpa)

@@ -547,6 +547,14 @@ def too_short(time_s, kpa):
     return time_s[:300], kpa[:300]
 
 
+def fast(time_s, kpa):
+    return 1.05 * time_s, kpa
+
+
+def slow(time_s, kpa):
+    return 0.97 * time_s, kpa
+
+
 def of_something_else(time_s, kpa):
     return time_s, 50.0 + 40.0 * np.sin(time_s * 3.0)
 
@@ -563,6 +571,8 @@ def not_finite(time_s, kpa):
         (falling, "follows"),
         (in_bar, "bar"),
         (too_short, "recording's"),
+        (fast, "the table's clock runs 5.0% fast"),
+        (slow, "the table's clock runs 3.0% slow"),
         (of_something_else, "do not follow"),
         (not_finite, "not finite"),
     ],
