@@ -134,6 +134,7 @@ class Kind:
     Attributes:
         value: if none is given.
         bounds: what `value` may be; None if there is none.
+        whole: whether it counts or numbers something.
         on: what `board` may name.
         aim: raises a ConfigurationError if the fault cannot be at the place that its value names.
     """
@@ -143,6 +144,7 @@ class Kind:
     begin: Begin
     value: float | None = None
     bounds: tuple[float, float] | None = None
+    whole: bool = False
     aim: Callable[[FaultyRobot, Fault], object] | None = None
     on: Literal["skin", "skin or fingertip", "fingertip"] = "skin"
 
@@ -200,8 +202,9 @@ def check(fault: Fault) -> None:
             raise ConfigurationError(f'{key}: {shown}; fault "{fault.name}" has no {key}')
     if fault.value is not None and kind.bounds is not None:
         least, most = kind.bounds
-        if not least <= fault.value <= most:
-            raise ConfigurationError(f"value: {fault.value:g}; wanted {least:g} to {most:g}")
+        if not least <= fault.value <= most or (kind.whole and fault.value % 1):
+            wanted = f"{'a whole number, ' if kind.whole else ''}{least:g} to {most:g}"
+            raise ConfigurationError(f"value: {fault.value:g}; wanted {wanted}")
     if fault.until_s is not None and fault.until_s <= fault.at_s:
         raise ConfigurationError("until_s: wanted a time after at_s")
 
@@ -592,6 +595,7 @@ KINDS: dict[str, Kind] = {
         _chip_gone,
         0xFFFF,
         bounds=(0, 0xFFFF),
+        whole=True,
     ),
     "chip_back": Kind("a chip that was gone answers again", _CHIP, _chip_back),
     "stuck_taxel": Kind(
@@ -616,6 +620,7 @@ KINDS: dict[str, Kind] = {
         _wrong_address,
         3.0,
         bounds=(0, 3),
+        whole=True,
         aim=_other_slot,
     ),
     "swapped_lines": Kind(
@@ -624,6 +629,7 @@ KINDS: dict[str, Kind] = {
         _swapped_lines,
         1.0,
         bounds=(0, 3),
+        whole=True,
         aim=_other_line,
     ),
     "shared_address": Kind(
@@ -632,6 +638,7 @@ KINDS: dict[str, Kind] = {
         _shared_address,
         3.0,
         bounds=(0, 3),
+        whole=True,
         aim=_other_slot,
     ),
     "no_acknowledge": Kind(
@@ -641,6 +648,7 @@ KINDS: dict[str, Kind] = {
         _no_acknowledge,
         1.0,
         bounds=(0, 255),
+        whole=True,
     ),
     "data_held_low": Kind(
         "a chip holds its data line low; value: until so many clocks have passed, 0 for ever",
@@ -648,6 +656,7 @@ KINDS: dict[str, Kind] = {
         _data_held_low,
         9.0,
         bounds=(0, 1_000_000),
+        whole=True,
     ),
     "clock_stretched": Kind(
         "a chip holds the clock, which all lines share, low after each of its bytes; value: us",
@@ -669,6 +678,7 @@ KINDS: dict[str, Kind] = {
         _slow_rise,
         50.0,
         bounds=(1, 1_000_000),
+        whole=True,
     ),
     "brown_out": Kind(
         "the supply of a chip fails for a moment: registers at reset, RAM random",
@@ -685,6 +695,7 @@ KINDS: dict[str, Kind] = {
         _board_latched,
         0.0,
         bounds=(0, 2),
+        whole=True,
         on="fingertip",
     ),
     "late_period": Kind(

@@ -6,6 +6,7 @@ A board on real chips and a real bus makes an MTB of a single-board computer.
 import errno
 import logging
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 
 import can
 import numpy as np
@@ -14,16 +15,28 @@ from can.interfaces.virtual import VirtualBus
 from numpy.typing import NDArray
 from smbus2 import SMBus
 
+from emulator.boards.chip_access import CHIPS_PER_LINE, SLOTS
 from emulator.boards.mtb import I2cChips, make_board
 from emulator.clock import EmulatedTime, RealClock
 from skin_host.bus.pair import PairBus
+from skin_host.bus.port import one_line
 from skin_host.bus.wire import FrameBatch, MessageClass
+from skin_host.errors import RequestError
 
 log = logging.getLogger(__name__)
 
 LONGEST_DATA = 8
-#: Codes of the system for an interface that is no more.
-_REMOVED = {errno.ENODEV, errno.ENXIO}
+#: Codes of the system for an interface that is no more, and for the end of a connection to a server
+#: of buses.
+_ENDED = {
+    errno.ENODEV,
+    errno.ENXIO,
+    errno.EPIPE,
+    errno.ECONNABORTED,
+    errno.ECONNRESET,
+    errno.ENOTCONN,
+    errno.ETIMEDOUT,
+}
 #: Boards act on commands only, which come from address 0: class and sender of an identifier.
 _COMMANDS = {
     message_class << 4 for message_class in (MessageClass.ANALOG_COMMAND, MessageClass.MANAGEMENT)
@@ -38,6 +51,8 @@ POLL_NS = 2_000_000
 MOST_READS = 10_000
 #: Frames kept for a controller that does not take them now.
 WAITING_FRAMES = 2000
+#: Data lines of a board.
+MOST_LINES = SLOTS // CHIPS_PER_LINE
 
 
 class BoardLink:
@@ -134,10 +149,12 @@ class BoardLink:
 
     def _complain(self, error: Exception) -> None:
         if not self._failing:
+            # What caused it is one sentence; what a library makes of that may be a traceback.
+            cause = error.__cause__ or error
             ends = "frames wait or are lost until it works"
-            if getattr(error, "error_code", None) in _REMOVED:
+            if {getattr(error, "error_code", None), getattr(cause, "errno", None)} & _ENDED:
                 ends = "start the emulator again when it is back"
-            log.warning("bus %s: %s; %s", self._name, error, ends)
+            log.warning("bus %s: %s; %s", self._name, one_line(cause), ends)
         self._failing = True
 
 
@@ -147,6 +164,33 @@ def _is_damage(error: Exception) -> bool:
         cause = error.__cause__
         return cause is not None and not isinstance(cause, OSError)
     return not isinstance(error, OSError)
+
+
+def open_lines(devices: str, opened: ExitStack) -> list[SMBus]:
+    """Open the data lines of a board of real chips.
+
+    Args:
+        devices: of I2C, such as "/dev/i2c-1,/dev/i2c-2".
+        opened: closes them.
+
+    Raises:
+        RequestError: none is named, or more than a board has.
+        OSError: one cannot be opened; the error names it.
+    """
+    paths = [path.strip() for path in devices.split(",")]
+    if not all(paths) or len(paths) > MOST_LINES:
+        raise RequestError(
+            f'--i2c: seen "{devices}", wanted 1 to {MOST_LINES} devices such as '
+            "/dev/i2c-1,/dev/i2c-2"
+        )
+    lines = []
+    for path in paths:
+        try:
+            lines.append(opened.enter_context(SMBus(path)))
+        except OSError as error:
+            error.filename = path
+            raise
+    return lines
 
 
 async def run_board(

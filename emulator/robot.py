@@ -4,6 +4,7 @@
 commands. Nothing here knows the time of day; only `run` communicates with the outside.
 """
 
+import asyncio
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -47,6 +48,8 @@ POLL_NS = 2_000_000
 #: Boards do not stall with a computer: a process that was held up catches up. One that was stopped
 #: for longer than this first leaves out whole periods of its boards.
 LONGEST_CATCH_UP_NS = 5_000_000_000
+#: A longer time is lived in parts, between which other tasks run: one of them may end the robot.
+LONGEST_PART_NS = 500_000_000
 #: After a longer pause, in the host's time, it has found boards silent, on a bus that does not show
 #: it a pause.
 STALL_NS = 150_000_000
@@ -355,13 +358,22 @@ class Robot:
             passed_ns = max(0, now_ns - ahead_ns - self.t_ns)
             # Commands came one after the other in this time: boards whose computer was busy
             # must not get them all at once, chips convert between them.
-            steps = []
+            steps: list[dict[str, FrameBatch]] = []
             for command in [*commands, None]:
-                steps.append(self.step(passed_ns / (len(commands) + 1) / NS))
+                steps += await self._live(passed_ns / (len(commands) + 1))
                 if command is not None:
                     self.receive(*command)
             self._send(links, steps, clock, ahead_ns)
             await clock.sleep_until_ns(now_ns + POLL_NS)
+
+    async def _live(self, passed_ns: float) -> list[dict[str, FrameBatch]]:
+        """Let a time pass, in equal parts if it is long."""
+        n = max(1, math.ceil(passed_ns / LONGEST_PART_NS))
+        steps = [self.step(passed_ns / n / NS)]
+        for _ in range(n - 1):
+            await asyncio.sleep(0)
+            steps.append(self.step(passed_ns / n / NS))
+        return steps
 
     def _send(
         self,

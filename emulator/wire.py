@@ -72,7 +72,7 @@ class Wire:
     def babble(self, share: float, t_ns: int) -> None:
         """From `t_ns` on a node fills `share` of the bus with frames of identifier 0."""
         frame_ns = (OVERHEAD_BITS + STUFF_BITS + 64) * self._bit_ns
-        self._babble_every_ns = round(frame_ns / share) if share else 0
+        self._babble_every_ns = round(min(frame_ns / share, NEVER_NS)) if share else 0
         self._babbled_ns = t_ns
 
     def put(self, batch: FrameBatch, ready_ns: int | None = None) -> None:

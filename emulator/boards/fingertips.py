@@ -4,9 +4,10 @@ A probe of the scene presses along the inward normal at its place; where it is a
 the surface, it carries an object that sticks and slips (`held_objects`). The board measures force
 and torque about its own origin, along its own axes, with an offset.
 
-The firmware of such a board (STRAIN2) is emulated as the bus sees it: it answers the same commands
-as a real one and streams force and torque of the load that is laid on it. It makes its own bytes:
-host and board share no encoder.
+The firmware of such a board (STRAIN2) is emulated as far as a host needs it: it takes the commands
+of discovery, version, mode, period and full scales, none of its calibration and amplifiers, and
+streams force and torque of the load that is laid on it. It makes its own bytes: host and board
+share no encoder.
 """
 
 import struct
@@ -74,13 +75,15 @@ NS_PER_MS = 1_000_000
 #: Loads that boards measured are known for so long at least.
 LATELY_NS = 1_000_000_000
 _WORDS = struct.Struct("<3H")
-_SET_MODE, _SET_PERIOD, _GET_FULL_SCALE = 0x07, 0x08, 0x18
+_SET_MODE, _SET_PERIOD, _GET_FULL_SCALE, _GET_VERSION = 0x07, 0x08, 0x18, 0x1C
 _STOP = 1
 #: Lowest bit of the types of frames with force, and with torque.
 FORCE, TORQUE = 0, 1
-#: Command FF of class 7, "who is there?", and the answer: FF, type of board STRAIN2, firmware.
+#: Command FF of class 7, "who is there?". The answer is FF, type of board STRAIN2, firmware; that
+#: to 1C has the version of the protocol behind them.
 _DISCOVER = 0xFF
-_IDENTITY = bytes([_DISCOVER, 12, 2, 0, 9])
+_IDENTITY = bytes([12, 2, 0, 9])
+_PROTOCOL = (2, 0)
 #: Frames of each mode: pairs of types (force, torque), and whether they are calibrated.
 _STREAMS: dict[int, list[tuple[int, int, bool]]] = {
     0: [(0xA, 0xB, True)],
@@ -137,27 +140,31 @@ class StrainBoard:
         return off
 
     def handle(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """Take a frame from the bus; give what the board sends back."""
-        asked = [
-            identifier(MessageClass.MANAGEMENT, HOST_ADDRESS, to)
-            for to in (self.address, BROADCAST_ADDRESS)
-        ]
-        if can_id in asked and data[:1] == _IDENTITY[:1]:
-            answer = identifier(MessageClass.MANAGEMENT, self.address, HOST_ADDRESS)
-            return [(answer, _IDENTITY)]
-        mine = identifier(MessageClass.ANALOG_COMMAND, HOST_ADDRESS, self.address)
-        if can_id != mine or len(data) < 2:
+        """Take a frame from the bus, to this board or to all; give what it sends back."""
+        if can_id & 0xF not in {self.address, BROADCAST_ADDRESS}:
+            return []
+        message_class = MessageClass(can_id >> 8 & 7)
+        if can_id != identifier(message_class, HOST_ADDRESS, can_id & 0xF):
+            return []
+        answer = identifier(message_class, self.address, HOST_ADDRESS)
+        if message_class == MessageClass.MANAGEMENT and data[:1] == bytes([_DISCOVER]):
+            return [(answer, bytes([_DISCOVER]) + _IDENTITY)]
+        if message_class != MessageClass.ANALOG_COMMAND or len(data) < 2:
             return []
         command, argument = data[0], data[1]
-        if command == _SET_MODE and argument in _STREAMS:
-            self._mode = argument
-            self.next_ns = None if argument == _STOP else t_ns + self.period_ms * NS_PER_MS
+        if command == _SET_MODE:
+            # A mode that it does not have stops it.
+            self._mode = argument if argument in _STREAMS else _STOP
+            self.next_ns = None if self._mode == _STOP else t_ns + self.period_ms * NS_PER_MS
         elif command == _SET_PERIOD and argument > 0:
             self.period_ms = argument
         elif command == _GET_FULL_SCALE and argument < 6:
             high, low = divmod(min(round(self._full_scale[argument]), 0xFFFF), 256)
-            answer = identifier(MessageClass.ANALOG_COMMAND, self.address, HOST_ADDRESS)
             return [(answer, bytes([_GET_FULL_SCALE, argument, high, low]))]
+        elif command == _GET_VERSION and len(data) > 2:
+            major, minor = _PROTOCOL
+            fits = argument == major and data[2] <= minor
+            return [(answer, bytes([_GET_VERSION]) + _IDENTITY + bytes([major, minor, fits]))]
         return []
 
     def step(self, t_ns: int) -> FrameBatch:

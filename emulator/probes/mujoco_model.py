@@ -191,11 +191,16 @@ class MujocoModel:
         """Let an actuator's control stay at a value from now on, whatever the keyframes give.
 
         Raises:
-            RequestError: there is no such actuator.
+            RequestError: there is no such actuator, or the simulation takes no such control.
         """
         names = [self.model.actuator(number).name for number in range(self.model.nu)]
         if name not in names:
             raise RequestError(f'"{name}": no such actuator; there are: {", ".join(names)}')
+        most = self._mujoco.mjMAXVAL
+        if not abs(value) <= most:
+            raise RequestError(
+                f"{name}: seen {value:g}, wanted a number from {-most:g} to {most:g}"
+            )
         self._held[names.index(name)] = value
 
     # ------------------------------------------------------------------ contacts

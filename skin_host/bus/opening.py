@@ -85,9 +85,14 @@ def open_bus(name: str, bus: Bus) -> can.BusABC:
 
     Raises:
         ConfigurationError: python-can has no such kind of interface.
-        BusError: the interface is absent, down, not CAN, not permitted, or not supported, or its
-            package is not installed.
+        BusError: the interface is absent, down, not CAN, not permitted, or not supported, its
+            package is not installed, or it does not answer.
     """
     if bus.interface == "socketcan":
         return socketcan.open_checked(name, bus)
-    return adapters.open_bus(name, bus)
+    # In a thread, as `open_port` does it.
+    worker = SYSTEM.executor(f"adapter-{name}")
+    try:
+        return _opened(name, bus, worker.submit(adapters.open_bus, name, bus))
+    finally:
+        worker.close()

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import logging
 import os
+import stat
 import sys
 from collections.abc import Callable, Coroutine, Iterable
 from importlib import import_module
@@ -89,6 +90,7 @@ def add_commands(commands: Commands) -> None:
     emulate.add_argument("--board", metavar="NAME", help="the board of --i2c or --i2c-dev")
     emulate.add_argument(
         "--i2c",
+        type=filled,
         metavar="DEVICES",
         help="run --board on real chips: its I2C lines, such as /dev/i2c-1,/dev/i2c-2",
     )
@@ -273,12 +275,10 @@ def _emulate(arguments: argparse.Namespace) -> int:
 def _on_real_chips(
     arguments: argparse.Namespace, settings: "Settings", opened: contextlib.ExitStack
 ) -> Work:
-    from smbus2 import SMBus
-
     from emulator import link
 
     board = settings.boards[arguments.board]
-    lines = [opened.enter_context(SMBus(path.strip())) for path in arguments.i2c.split(",")]
+    lines = link.open_lines(arguments.i2c, opened)
     return lambda buses: link.run_board(board.model, board.address, lines, buses[board.bus])
 
 
@@ -325,19 +325,38 @@ def _on_emulated_chips(
         loop = asyncio.get_running_loop()
         for device in devices:
             loop.add_reader(device.fileno(), device.handle)
-        # A file or /dev/null cannot be waited for; then there are no commands.
-        with contextlib.suppress(PermissionError, ValueError, AttributeError):
-            loop.add_reader(sys.stdin.fileno(), take_commands, robot, bytearray(), model)
+        follow_commands(robot, model)
         await robot.run(buses, RealClock(arguments.speed))
 
     return work
+
+
+def follow_commands(robot: "Robot", model: "MujocoModel | None" = None) -> None:
+    """Take commands from stdin as they come; those of a file at once, as it cannot be waited for.
+
+    Args:
+        robot, model: see `take_commands`.
+    """
+    import asyncio
+
+    begun = bytearray()
+    is_file = False
+    # It may be closed, or another device that cannot be waited for, such as /dev/null.
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        descriptor = sys.stdin.fileno()
+        is_file = stat.S_ISREG(os.fstat(descriptor).st_mode)
+        if not is_file:
+            loop = asyncio.get_running_loop()
+            loop.add_reader(descriptor, take_commands, robot, begun, model)
+    while is_file and take_commands(robot, begun, model):
+        pass
 
 
 def take_commands(
     robot: "Robot",
     begun: bytearray,
     model: "MujocoModel | None" = None,
-) -> None:
+) -> bool:
     """Read what waits on stdin, never for the rest of a line: each line is a fault such as
     `chip_gone board=hand triangle=3`, or `mend` and it.
 
@@ -347,11 +366,14 @@ def take_commands(
         robot: is given the faults.
         begun: a line whose end has not come.
         model: of the scene.
+
+    Returns:
+        Whether there may be more.
     """
     try:
         data = os.read(sys.stdin.fileno(), LONGEST_COMMAND)
     except BlockingIOError:  # another reader of it was faster
-        return
+        return True
     except OSError:  # such as that of a terminal, for an orphan in the background
         data = b""
     if not data:
@@ -370,6 +392,7 @@ def take_commands(
             _take_command(robot, line.decode(errors="replace"), model)
         except RequestError as error:
             print(f"skin emulate: {visible(str(error))}", file=sys.stderr, flush=True)
+    return bool(data)
 
 
 def _take_command(robot: "Robot", line: str, model: "MujocoModel | None") -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import math
+import threading
 import time
 import tracemalloc
 
@@ -363,3 +364,15 @@ def test_an_adapter_that_lacks_its_options_names_where_they_are_given():
     wanted = r"'host' and 'port'; .* from \[buses\.left\.options\]"
     with pytest.raises(BusError, match=wanted):
         open_bus("left", Bus(interface="socketcand", channel="can0"))
+
+
+def test_an_adapter_that_does_not_answer_is_named_to_the_emulator_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It waited for ever, without a word, as for a server of buses that greets and does no more."""
+    ended = threading.Event()
+    monkeypatch.setattr(adapters, "OPEN_S", 0.2)
+    monkeypatch.setattr("can.Bus", lambda **_: ended.wait(PATIENCE_S))
+    with pytest.raises(BusError, match=r"kvaser 0: has not answered for 0\.2 s: check its plug"):
+        open_bus("left", Bus(interface="kvaser", channel="0"))
+    ended.set()

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from emulator.robot import Robot
-from skin_host.cli.without_robot import take_commands
+from skin_host.cli.without_robot import follow_commands, take_commands
 from skin_host.layout import load_skin
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
@@ -97,3 +97,34 @@ def test_a_robot_that_continues_from_a_state_has_its_faults_mended(
     send(again, "mend bus_off bus=can0\n", pipe, monkeypatch)
     assert not again.wires["can0"].off
     assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize("end", ["\n", ""])
+async def test_the_lines_of_a_file_are_taken_at_the_start(
+    robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str
+) -> None:
+    """A file cannot be waited for: `skin emulate CONFIG < FILE` took nothing, without a word."""
+    lines = ["bus_off bus=can0"] + [f"chip_gone board=hand triangle={n % 5}" for n in range(500)]
+    path = tmp_path / "faults"
+    path.write_text("\n".join(lines) + end)
+    with path.open() as file:
+        monkeypatch.setattr(sys, "stdin", file)
+        follow_commands(robot)
+    assert robot.wires["can0"].off
+    assert len(robot.faults_on) == 6
+
+
+@pytest.mark.parametrize("device", [Path("/dev/null"), Path("/dev/zero")], ids=str)
+async def test_what_can_neither_be_waited_for_nor_is_a_file_has_no_commands(
+    device: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with device.open() as file:
+        monkeypatch.setattr(sys, "stdin", file)
+        follow_commands(ROBOT)
+
+
+async def test_a_standard_input_that_is_closed_has_no_commands(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    follow_commands(ROBOT)

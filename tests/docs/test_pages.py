@@ -189,6 +189,17 @@ def test_extending_adds_a_layout_a_model_and_a_fault(extended: dict[str, Any]) -
     assert extended["again"].valid.all()
 
 
+def test_the_fault_of_the_page_is_listed_and_mended_as_all_others(extended: dict[str, Any]) -> None:
+    robot, line = extended["robot"], faults.parse("loose_plug board=pad")
+    assert robot.faults_on == []
+    for _ in range(2):
+        robot.inject(line)
+    robot.inject(faults.parse("board_reset board=pad"))
+    assert robot.faults_on == [line, line]
+    assert robot.mend(line)
+    assert robot.faults_on == []
+
+
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
 def test_the_model_of_the_page_keeps_the_promises_of_all_models(
     extended: dict[str, Any], wrong: float

@@ -472,6 +472,21 @@ def refused_value(value: float) -> str:
             for value in values
         ),
         *(
+            (
+                Fault(name=name, board="hand", triangle=0, value=2.5),
+                refused_value(2.5) + " a whole number, ",
+            )
+            for name in (
+                "chip_gone",
+                "wrong_address",
+                "swapped_lines",
+                "shared_address",
+                "no_acknowledge",
+                "data_held_low",
+                "slow_rise",
+            )
+        ),
+        *(
             (Fault(name="temperature_step", value=value), refused_value(value))
             for value in (-1e6, 1e6)
         ),

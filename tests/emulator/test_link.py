@@ -120,10 +120,41 @@ def test_a_bus_that_fails_is_logged_once_and_works_again(
     assert (link.sent, link.lost) == (3, 0)
 
 
-def test_an_interface_that_was_removed_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    with Adapter(can.CanOperationError("No such device", errno.ENODEV)) as bus:
+def caused(error: can.CanError, cause: Exception) -> can.CanError:
+    """As a library raises it, with a traceback in its text."""
+    error.__cause__ = cause
+    return error
+
+
+@pytest.mark.parametrize(
+    ("failure", "reason"),
+    [
+        (can.CanOperationError("No such device", errno.ENODEV), "No such device"),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), "Broken pipe"),
+        (
+            caused(
+                can.CanError("failed  Traceback (most recent call last):\n"),
+                ConnectionResetError(errno.ECONNRESET, "Connection reset by peer"),
+            ),
+            "Connection reset by peer",
+        ),
+        (
+            caused(can.CanError("timed out\n"), TimeoutError(errno.ETIMEDOUT, "timed out")),
+            "timed out",
+        ),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_bus_that_never_works_again_is_named_in_a_line(
+    failure: Exception, reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An interface that was removed, or a server of buses that has ended."""
+    with Adapter(failure) as bus:
         assert list(BoardLink("can0", bus).received()) == []
-    assert "start the emulator again" in caplog.records[0].getMessage()
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert reason in line
+    assert line.endswith("start the emulator again when it is back")
+    assert "\n" not in line
 
 
 def test_a_bus_on_which_commands_never_end_lets_the_boards_live() -> None:

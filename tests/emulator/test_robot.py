@@ -323,6 +323,21 @@ async def test_a_busy_computer_delays_frames_but_not_their_time_stamps() -> None
     assert stamps_s[-1] <= clock.now_ns() * 1e-9
 
 
+async def test_a_robot_that_is_slower_than_its_time_can_be_ended() -> None:
+    """Signals are processed between two parts of a time that is long."""
+    robot, clock = Robot(*load()), SteppedTime()
+    with can.Bus(interface="virtual", channel="test-slow") as inside:
+        life = asyncio.create_task(robot.run({"can0": inside}, clock))
+        await clock.advance(0.01)
+        await clock.advance(4.0)
+        for _ in range(3):
+            await asyncio.sleep(0)
+        life.cancel()
+        await asyncio.gather(life, return_exceptions=True)
+    assert life.cancelled()
+    assert 0 < robot.t_ns < 3_000_000_000
+
+
 async def test_a_pause_that_a_host_takes_for_silence_is_reported(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

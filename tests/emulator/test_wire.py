@@ -92,6 +92,15 @@ def test_frames_of_a_babbling_node_pass_as_if_arbitrated_one_by_one(seed: int) -
     assert wires[0].lost == wires[1].lost
 
 
+@pytest.mark.parametrize("share", [1e-300, 5e-324])
+def test_a_node_that_babbles_next_to_nothing_sends_one_frame(share: float) -> None:
+    """No number of its time holds how long the next one would be awaited."""
+    wire = wire_of()
+    wire.babble(share, 0)
+    assert wire.until(10 * MS).id.tolist() == [0]
+    assert len(wire.until(1000 * MS)) == 0
+
+
 @pytest.mark.parametrize("apart_us", [60, 99, 100, 130])
 def test_frames_that_are_handed_over_together_pass_as_one_by_one(apart_us: int) -> None:
     """Those of a force/torque board become ready one after the other; 6 bytes take 100 us."""

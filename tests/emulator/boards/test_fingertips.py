@@ -260,7 +260,8 @@ def test_health_names_a_latched_board_and_its_touch_ends() -> None:
     [
         ("board_latched board=hand", 'board: no fingertip "hand"; there are: index, thumb'),
         ("board_latched", "board: missing"),
-        ("board_latched board=index value=3", "value: 3; wanted 0 to 2"),
+        ("board_latched board=index value=3", "value: 3; wanted a whole number, 0 to 2"),
+        ("board_latched board=index value=0.5", "value: 0.5; wanted a whole number, 0 to 2"),
         ("board_silent board=foot", 'board: no board "foot"; there are: hand, index, thumb'),
         ("board_reset board=index", 'board: no board "index"; there are: hand'),
     ],

@@ -1,6 +1,7 @@
 """The firmware on smbus2 buses that it was given, and a python-can bus."""
 
 import asyncio
+from contextlib import ExitStack
 
 import can
 import numpy as np
@@ -20,6 +21,7 @@ from skin_host.bus.commands import (
     TxMode,
     command_frame,
 )
+from skin_host.errors import RequestError
 
 
 class ChipsInTime:
@@ -97,3 +99,17 @@ async def test_an_unknown_model_is_refused() -> None:
     with can.Bus(interface="virtual", channel="single-board") as bus:
         with pytest.raises(ValueError, match="there are: mtb3"):
             await link.run_board("mtb9", 1, [], bus)
+
+
+@pytest.mark.parametrize("devices", [",", " ", "/dev/i2c-1,", ",".join("123456")])
+def test_devices_that_are_not_the_lines_of_a_board_are_refused(devices: str) -> None:
+    with pytest.raises(RequestError, match="wanted 1 to 5 devices"), ExitStack() as opened:
+        link.open_lines(devices, opened)
+
+
+@pytest.mark.parametrize("device", ["/dev/null", "/dev/i2c-none", "/dev"])
+def test_a_device_that_is_no_i2c_line_is_named(device: str) -> None:
+    """That of a call to the driver alone would be unnamed."""
+    with pytest.raises(OSError) as raised, ExitStack() as opened:
+        link.open_lines(device, opened)
+    assert raised.value.filename == device

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from emulator.boards.fingertips import StrainBoard
-from skin_host.bus.answers import Discovered, parse_answer
-from skin_host.bus.commands import BoardType, Discover, command_frame
+from skin_host.bus.answers import Discovered, FirmwareVersion, parse_answer
+from skin_host.bus.commands import BoardType, Discover, GetFirmwareVersion, command_frame
 from skin_host.bus.strain import (
     StrainType,
     WrenchAssembler,
@@ -54,6 +54,29 @@ def test_a_board_is_silent_until_it_is_started_and_after_it_is_stopped():
     assert len(board.step(100 * MS)) == 10
     board.handle(0x203, bytes([0x07, 1]), 100 * MS)
     assert len(board.step(200 * MS)) == 0
+
+
+def test_a_mode_that_it_does_not_have_stops_a_board():
+    """Message_SET_TXMODE::load of embot_prot_can_analog_polling.cpp."""
+    board, _ = started()
+    board.handle(0x20D, bytes([0x07, 2]), 0)
+    assert len(board.step(50 * MS)) == 0
+
+
+def test_commands_to_everyone_are_obeyed():
+    """frameis4board of embot_prot_can.cpp, as with an MTB4."""
+    board, _ = started()
+    board.handle(0x20F, bytes([0x07, 1]), 0)
+    assert len(board.step(50 * MS)) == 0
+
+
+@pytest.mark.parametrize(("host", "compatible"), [((2, 0), 1), ((1, 0), 0), ((2, 1), 0)])
+def test_a_board_answers_with_its_version(host: tuple[int, int], compatible: int) -> None:
+    board = StrainBoard(3, lambda t_ns: LOAD, np.random.default_rng(1))
+    for to in (3, 15):
+        ((can_id, data),) = board.handle(*command_frame(GetFirmwareVersion(*host), to), 0)
+        wanted = FirmwareVersion(BoardType.STRAIN2, 2, 0, 9, 2, 0, compatible)
+        assert parse_answer(can_id, data) == (3, wanted)
 
 
 def test_the_period_is_the_hosts():
@@ -110,6 +133,8 @@ def test_a_board_says_who_it_is() -> None:
         (0x203, b""),
         (0x203, b"\x08\x00"),
         (0x203, b"\x18\x06"),
+        (0x203, b"\x1c\x02"),
+        (0x20F, b"\x18\x06"),
     ],
 )
 def test_nonsense_and_other_boards_commands_change_nothing(can_id, data):

@@ -392,6 +392,14 @@ def test_an_actuator_that_there_is_not_is_named(tmp_path: Path) -> None:
         model.set_control("grip", 1.0)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e300])
+def test_a_control_that_no_simulation_takes_is_refused(tmp_path: Path, value: float) -> None:
+    """MuJoCo would go on without any; not a number would let the keyframes have it again."""
+    model = MujocoModel(balls(tmp_path, [(40, 40)]), LAYOUT)
+    with pytest.raises(RequestError, match=r"push0: seen .*, wanted a number from -1e\+10"):
+        model.set_control("push0", value)
+
+
 def test_a_simulation_that_bursts_ends_with_a_sentence_and_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
