@@ -257,11 +257,13 @@ def run(
     work: "Callable[[asyncio.Event], Coroutine[Any, Any, T]]",
     duration_s: float | None = None,
     ending: Sequence[signal.Signals] | None = None,
+    *,
+    patient: bool = False,
 ) -> T:
     """Work, and return the result.
 
-    The event is set by the signals `ending`, by default those of `leaving`, of which a second one
-    ends at once, but for SIGHUP; and after `duration_s`.
+    The event is set by the signals `ending`, by default those of `leaving`, and after `duration_s`.
+    A second signal ends at once, but for SIGHUP, or never if this is `patient`.
     """
 
     import asyncio
@@ -275,6 +277,8 @@ def run(
             stop.set()
             for number in taken:
                 loop.remove_signal_handler(number)
+                if patient:
+                    signal.signal(number, signal.SIG_IGN)
             if signal.SIGHUP in taken:
                 _ignore_more_hangups()
 

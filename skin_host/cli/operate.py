@@ -243,7 +243,9 @@ def _run_node(arguments: argparse.Namespace) -> int:
         # Of a new calibration, gains come from the file later.
         memory = remembered(settings, layout, node, arguments.node, take_new=arguments.calibrate)
         warn_of_virtual(settings)
-        run(work, arguments.duration, service.ENDING)  # SIGHUP reloads
+        # SIGHUP reloads. A service sends a request to end to each share, and their parent, too.
+        is_share = arguments.share is not None
+        run(work, arguments.duration, service.ENDING, patient=is_share)
     return 0
 
 

@@ -143,6 +143,8 @@ class Daemon:
         #: How many reloads have begun, and why the last one failed.
         self._reloads = 0
         self._not_reloaded: SkinError | None = None
+        #: Why no calibration could be taken that nobody asked for.
+        self._not_calibrated = ""
         self._is_ending = False
         self._feed_s = service.watchdog_interval_s()
         self._fed_s = 0.0
@@ -400,8 +402,15 @@ class Daemon:
                 while calibrate or self.engine.calibration is None:
                     if await self._try_to_calibrate():
                         break
+                    await self._until_received()
             await self._calibrate_late()
         await asyncio.Event().wait()
+
+    async def _until_received(self) -> None:
+        """Wait until a board sends: before there is nothing to calibrate, nor to report again."""
+        before = self.engine.ledger.sweeps.copy()
+        while not (self.engine.ledger.sweeps > before).any():
+            await self.clock.sleep(LOOK_S)
 
     async def _calibrate_late(self) -> None:
         """Calibrate boards that no calibration has measured once they send, unless somebody does.
@@ -425,11 +434,15 @@ class Daemon:
         return [board for board in boards if not (measured & taxels_of([board])).any()]
 
     async def _try_to_calibrate(self, boards: list[int] | None = None) -> bool:
-        """Calibrate all, or boards by their index, and return True; or log why not, and pause."""
+        """Calibrate all, or boards by their index, and return True; or log why not, unless that was
+        logged last, and pause.
+        """
         try:
             await self.control.calibrate(self.settings.processing.calibration.seconds, boards)
         except SkinError as error:
-            log.warning("%s", error)
+            said, self._not_calibrated = self._not_calibrated, str(error)
+            if said != self._not_calibrated:
+                log.warning("%s", error)
             await self.clock.sleep(HEALTH_S)
             return False
         return True

@@ -61,6 +61,10 @@ class Keeper:
         self._state = memory.state
         self._zeros = memory.zeros
         self.unkept = dict(memory.unkept)
+        #: Id of the calibration in the file, which a start would find; empty if not known.
+        self._stored = ""
+        if memory.calibration is not None and "calibration" not in self.unkept:
+            self._stored = memory.calibration.id
         #: Files that were found or written.
         self._files = {what for what, file in self._path.items() if os.access(file, os.F_OK)}
         #: Of the calibration and the state. Zeros are written by one task at a time.
@@ -97,7 +101,9 @@ class Keeper:
         path, layout = self._path["calibration"], self._engine.layout
         await self._clock.in_thread(refuse_other_robot, path, layout.robot, "calibration")
         configuration = self._engine.configuration
-        return await self._clock.in_thread(find_calibration, path, layout, configuration)
+        found = await self._clock.in_thread(find_calibration, path, layout, configuration)
+        self._stored = "" if found is None else found.id
+        return found
 
     def known(self, calibration: Calibration) -> Known:
         """Return what is known of the skin by a calibration of before; see `memory.known_of`."""
@@ -119,7 +125,7 @@ class Keeper:
             if before is not None:
                 # Whichever of the two a start finds, the other boards keep their zeros.
                 await self._zeros_written()
-                self._begin(self._keep_zeros(replaced=before.id, doubted=doubted))
+                self._begin(self._keep_zeros(doubted=doubted))
                 await self._zeros_written()
             layout, configuration = self._engine.layout, self._engine.configuration
             await self._clock.in_thread(
@@ -200,10 +206,12 @@ class Keeper:
         *,
         ends: bool = False,
         anyway: bool = False,
-        replaced: str = "",
         doubted: Mask | bool = False,
     ) -> None:
-        """Write the zeros, see `zeros.zeros_of`, if they have changed, or `anyway`."""
+        """Write the zeros, see `zeros.zeros_of`, if they have changed, or `anyway`.
+
+        Until the calibration in use is in its file, they are those of the one that is there, too.
+        """
         engine, before = self._engine, self._zeros
         if engine.calibration is None:
             return
@@ -214,7 +222,7 @@ class Keeper:
             self._touches.kept,
             ends=ends,
             found=n_found != self._n_kept,
-            replaced=replaced,
+            replaced="" if self._stored == engine.calibration.id else self._stored,
             doubted=doubted,
         )
         is_news = zeros != before and bool(zeros.baselines or _doubts(zeros) or _doubts(before))
@@ -231,6 +239,7 @@ class Keeper:
         if found is not None and await self._write(
             "calibration", lambda path: save_calibration(path, found, layout)
         ):
+            self._stored = found.id
             log.info("calibration %s kept in %s", found.id, self._path["calibration"])
 
     async def _write_state(self) -> bool:

@@ -453,10 +453,12 @@ class Link:
 
     async def stop(self) -> None:
         """Command the boards to stop, as far as their buses still work."""
-        for boards in self._all_boards():
-            with contextlib.suppress(BusError, TimeoutError):
-                async with self._clock.timeout(STOP_S):
-                    await boards.stop()
+        await asyncio.gather(*(self._stop(boards) for boards in self._all_boards()))
+
+    async def _stop(self, boards: Boards | StrainBoards) -> None:
+        with contextlib.suppress(BusError, TimeoutError):
+            async with self._clock.timeout(STOP_S):
+                await boards.stop()
 
     def close(self) -> None:
         for port in self.ports.values():

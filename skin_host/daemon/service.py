@@ -73,7 +73,8 @@ def ended_at_once() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            if signal.getsignal(number) is not signal.SIG_IGN:  # by who needs to be asked once only
+                signal.signal(number, handler)
 
 
 def notify_reloading(clock: "Clock") -> None:

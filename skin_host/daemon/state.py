@@ -68,8 +68,8 @@ class Zeros(Struct, forbid_unknown_fields=True):
 
     Attributes:
         calibration: id of the calibration in use; a later one has measured the zeros.
-        before: id of the one before, while a calibration of some boards is being written: until its
-            file has its name, a start finds that one.
+        before: id of the one that a start finds, while that in use is not in its file: it is being
+            written, or could not be.
         unknown: numbers of taxels by part whose zero is not known, or will not be after the next
             start.
         touched: numbers of taxels by part that something touches, or touched when their board was

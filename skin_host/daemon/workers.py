@@ -83,15 +83,18 @@ async def run(commands: dict[str, list[str]]) -> int:
     ending: int | None = None  # the signal that asked for it
 
     def forward(number: int) -> None:
-        nonlocal ending
-        if number != signal.SIGHUP:
-            ending = number
         for process in processes.values():
             with contextlib.suppress(ProcessLookupError):
                 process.send_signal(number)
 
-    for caught in (*service.ENDING, signal.SIGHUP):
-        loop.add_signal_handler(caught, forward, caught)
+    def end(number: int) -> None:
+        nonlocal ending
+        forward(number if ending is None else signal.SIGKILL)  # a second one ends at once
+        ending = number
+
+    for caught in service.ENDING:
+        loop.add_signal_handler(caught, end, caught)
+    loop.add_signal_handler(signal.SIGHUP, forward, signal.SIGHUP)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="skin-run-")))
         for number, (name, arguments) in enumerate(commands.items()):
@@ -113,7 +116,7 @@ async def run(commands: dict[str, list[str]]) -> int:
         service.take_hangups()
         waiting = [asyncio.ensure_future(process.wait()) for process in processes.values()]
         await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-        if ending is None:  # a second signal would end them at once
+        if ending is None:
             forward(signal.SIGTERM)
         _, left = await asyncio.wait(waiting, timeout=STOP_S)
         if left:

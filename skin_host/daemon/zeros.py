@@ -45,7 +45,7 @@ def zeros_of(
         lasting: bool[n], touches that have lasted.
         ends: the daemon ends, and what is touched now will not be known.
         found: zeros were found since.
-        replaced: id of the calibration before, if it may be the one that a start finds.
+        replaced: id of another calibration, if that may be the one that a start finds.
         doubted: bool[n], taxels whose zero was not known by that one.
     """
     calibration, pipeline = engine.calibration, engine.pipeline
@@ -60,7 +60,7 @@ def zeros_of(
         return {name: mine for name, mine in by_part.items() if mine}
 
     baselines = before.baselines
-    if ends or found or (baselines and before.calibration != calibration.id):
+    if ends or found or replaced or (baselines and before.calibration != calibration.id):
         baselines = {
             part.name: np.round(pipeline.baseline[part.start : part.stop], 2).tolist()
             for part in parts

@@ -243,13 +243,14 @@ def _identity(name: str, payload: bytes) -> str | int | UnsetType:
 
 def _failure(name: str, identity: str | int | UnsetType, error: SkinError) -> bytes:
     command = name if _NAME.fullmatch(name) else "?"
+    why = str(error)
     return msgspec.json.encode(
         Result(
             RESULT_SCHEMA,
             command,
             ok=False,
             id=identity,
-            error=str(error),
+            error=visible(why, len(why)),  # one line, whatever the request has brought into it
             cause=_cause(error),
         )
     )

@@ -7,7 +7,7 @@ losses are counted, and for retained messages the newest of each topic.
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from itertools import islice
 from typing import NamedTuple
 
@@ -297,9 +297,14 @@ class Outbox:
             self.trials.arrived(topic)
         self._note_emptied()
 
-    def repeat_states(self) -> None:
-        """Send all retained messages again, to a broker that may have lost them."""
-        self.pending = {topic: None for topic in self.retained if not self._is_given_up(topic)}
+    def repeat_states(self, first: Collection[str] = ()) -> None:
+        """Send all retained messages again, to a broker that may have lost them.
+
+        Args:
+            first: topics that go before all others; they have been put.
+        """
+        topics = {**dict.fromkeys(first), **self.retained}
+        self.pending = {topic: None for topic in topics if not self._is_given_up(topic)}
         self.retained_put.set()
 
     def give_up_state(self, topic: str) -> None:

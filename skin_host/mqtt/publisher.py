@@ -415,7 +415,9 @@ class Publisher:
         else:
             self._note_connected(connection)
         self._publish_info()
-        self._outbox.repeat_states()
+        # The status makes valid what the broker retained of contacts, however old that is.
+        contacts = (self.topics.part("contact", part) for part in self._states_of_contact)
+        self._outbox.repeat_states([self._status, *contacts])
         if self._last_broker not in (None, str(self._broker)):
             self._courier.repeat_events()
         self._last_broker = str(self._broker)

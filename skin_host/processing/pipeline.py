@@ -80,7 +80,7 @@ class Pipeline:
     ) -> None:
         """Apply changed settings or a changed calibration; the state is kept.
 
-        Only another relaxation model starts without a state.
+        Only another relaxation model starts without a state, and one of another scale of pressure.
 
         Args:
             settings: how to process from now on.
@@ -250,7 +250,9 @@ class _PartPipeline:
             other_foam = rules.curves is not before.curves
         else:
             other_foam = not rules.curves.is_same(before.curves)
-        if other_foam or (other_model and rules.curves is None):
+        # What the foam has lost is known in kPa, which a byte stands for no longer.
+        other_scale = not np.array_equal(rules.curve.linear, before.curve.linear)
+        if other_foam or other_scale or (other_model and rules.curves is None):
             self._windows.fold()
             self._set_model(rules)
         elif self._own is not None:

@@ -1,6 +1,7 @@
 """Files of the state directory: damaged ones are set aside, newer ones left alone, all reported."""
 
 import asyncio
+import errno
 import json
 import logging
 import socket
@@ -18,6 +19,7 @@ from skin_host.config.settings import Bus, Mqtt, changed, load
 from skin_host.daemon import metrics
 from skin_host.daemon.calibrate import calibration_path, stored_calibration
 from skin_host.daemon.daemon import Daemon
+from skin_host.daemon.memory import remembered
 from skin_host.daemon.state import NodeState, Zeros, load_kept
 from skin_host.errors import NewerFileError, OtherRobotError
 from skin_host.files import write_document
@@ -26,7 +28,7 @@ from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.calibration.file import save_calibration
 from tests.support.broker import Mosquitto, free_port
 from tests.support.fault_bench import FaultBench
-from tests.support.live import CONFIG, living
+from tests.support.live import CONFIG, FINGER_N, living
 from tests.support.stepped import stepped
 from tests.support.waiting import PATIENCE_S, until
 
@@ -409,6 +411,44 @@ async def test_of_two_writes_of_the_zeros_the_newer_one_stays_however_long_the_f
         goes_on.set()
         await ending
         assert load_kept(tmp_path / "demo-main.zeros.json", Zeros).unknown == {"left_hand": [1]}
+
+
+@stepped
+async def test_zeros_belong_to_the_calibration_that_is_kept_while_a_newer_one_is_not(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that is nearly full takes the smaller file alone. The next start would judge boards
+    that still send by zeros of before, and not know what presses a pad that was zeroed in a press.
+    """
+
+    def full(path: Path, *_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        await live.until_well()
+        daemon, finger = live.daemon, live.finger()
+        kept = daemon.engine.calibration
+        finger.press(FINGER_N / 4)  # bytes do not end when it is lifted
+        await live.wait(lambda: bool(daemon.engine.zeros.touched().any()))
+        await daemon.configure()
+        await live.wait(lambda: bool(doubted(daemon)))
+        pressed = np.array(doubted(daemon))
+        finger.press(0.0)
+        await clock.sleep(60.0)  # foam recovers
+        monkeypatch.setattr("skin_host.daemon.keeper.save_calibration", full)
+        await daemon.calibrate(2.0)
+        await clock.sleep(3.0)
+        crashed = tmp_path / "demo-main.zeros.json"
+        after_a_crash = crashed.read_bytes()
+    crashed.write_bytes(after_a_crash)
+    memory = remembered(daemon.settings, daemon.layout, "main")
+    assert kept is not None and memory.calibration is not None
+    assert memory.calibration.id == kept.id
+    next_one = Daemon(daemon.settings, daemon.layout, memory=memory)
+    assert next_one.engine.pipeline is not None and daemon.engine.pipeline is not None
+    baseline = daemon.engine.pipeline.baseline[pressed]
+    assert (baseline < -5.0).any()
+    np.testing.assert_allclose(next_one.engine.pipeline.baseline[pressed], baseline, atol=1.5)
 
 
 @pytest.mark.parametrize("configuration", ["other", "same", "damaged"])

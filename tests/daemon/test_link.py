@@ -3,6 +3,7 @@
 import contextlib
 import socket
 import threading
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 
 from skin_host.bus import wire
 from skin_host.bus.assembler import AssemblerCounters
-from skin_host.bus.port import LinkState
+from skin_host.bus.port import SEND_DEADLINE_S, LinkState
 from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings
@@ -21,6 +22,7 @@ from skin_host.errors import BusError
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine, Output
 from tests.support.ports import StillPort
+from tests.support.stepped import stepped
 from tests.support.waiting import PATIENCE_S
 
 MS = 1_000_000
@@ -336,6 +338,30 @@ def test_a_bus_that_cannot_be_opened_leaves_no_other_one_open() -> None:
         Link(Engine(settings, build_layout(settings, Path()), [0, 1]), open_port=open_one)
     failed.set()
     assert closed.wait(PATIENCE_S)
+
+
+@stepped
+async def test_buses_that_take_nothing_are_stopped_beside_each_other(clock: SteppedClock) -> None:
+    """An iCub has seven, and systemd kills a service that takes more than 5 s to end."""
+    names = [f"can{number}" for number in range(7)]
+    settings = Settings(
+        robot="r",
+        buses={name: Bus() for name in names},
+        boards={name: Board(bus=name, address=1) for name in names},
+        parts={name: Part(patches=[Patch(board=name, triangles="0")]) for name in names},
+    )
+
+    class Unacknowledged(StillPort):
+        async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = 0.0) -> None:
+            await clock.sleep(SEND_DEADLINE_S)
+            raise BusError("the transmit queue stayed full")
+
+    engine = Engine(settings, build_layout(settings, Path()), [*range(len(names))])
+    link = Link(engine, open_port=Unacknowledged, clock=clock)
+    since_s = clock.monotonic_s()
+    await link.stop()
+    assert clock.monotonic_s() - since_s < 1.5
+    link.close()
 
 
 def test_the_time_that_opening_takes_is_no_stall_of_this_computer() -> None:

@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 
 from skin_host.cli import main
-from skin_host.config.settings import changed, load, load_running, needs_restart
+from skin_host.clock import SteppedClock
+from skin_host.config.settings import Bus, changed, load, load_running, needs_restart
 from skin_host.errors import RequestError
+from skin_host.layout import build_layout
+from skin_host.mqtt.messages import ContactState
 from tests.support.branch import branch
 from tests.support.fault_bench import FaultBench
+from tests.support.live import FINGER_N, living
+from tests.support.stepped import stepped
 
 CONFIG = Path(__file__).parents[2] / "config"
 EXCHANGEABLE = {"covered", "foam_mm", "frames", "localization", "probe_mm"}
@@ -159,3 +164,30 @@ def test_what_a_daemon_runs_with_is_one_line_if_it_is_absent_or_damaged(
     path.write_bytes(content)
     with pytest.raises(RequestError, match="damaged"):
         load_running(path)
+
+
+@stepped
+async def test_a_press_lasts_over_another_scale_of_pressure_and_back(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    """What foam had lost in kPa of before was more than all of the press: it was published as
+    released, and its part as `OFF`.
+    """
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        await live.until_well()
+        daemon = live.daemon
+        configured = daemon._configured
+        put, states = daemon.publisher.put_contact, set[str]()
+
+        def note(part: str, state: ContactState) -> None:
+            states.update({state} if part == "left_hand" else ())
+            put(part, state)
+
+        live.finger().press(FINGER_N)
+        await clock.sleep(20.0)
+        daemon.publisher.put_contact = note  # type: ignore[method-assign]
+        for foam_mm in (20.0, configured.processing.pressure.foam_mm):
+            other = changed(configured, {"processing.pressure.foam_mm": foam_mm})
+            daemon._swap(other, build_layout(other, CONFIG))
+            await clock.sleep(20.0)
+        assert states == {"ON"}

@@ -191,6 +191,37 @@ async def test_a_stop_while_daemons_are_started_reaches_each_of_them(
     assert [daemon.signals for daemon in daemons] == [[asked]] * started
 
 
+async def test_a_second_stop_ends_every_daemon_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A share takes no second request itself: a service sends it two of the same."""
+
+    class Hangs(Ends):
+        def send_signal(self, number: int) -> None:
+            self.signals.append(number)
+            if number == signal.SIGKILL:
+                self._ended.set()
+
+    on_signal: dict[int, Callable[[], object]] = {}
+    daemons: list[Hangs] = []
+
+    def take(number: int, handler: Callable[..., object], *args: object) -> None:
+        on_signal[number] = lambda: handler(*args)
+
+    async def start(*_: object, **__: object) -> Hangs:
+        daemons.append(Hangs())
+        return daemons[-1]
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "add_signal_handler", take)
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    running = asyncio.create_task(workers.run({"main-1": ["run"], "main-2": ["run"]}))
+    await until(lambda: len(daemons) == 2)
+    on_signal[signal.SIGHUP]()
+    on_signal[signal.SIGINT]()
+    on_signal[signal.SIGTERM]()
+    assert await asyncio.wait_for(running, PATIENCE_S) == 1
+    wanted = [signal.SIGHUP, signal.SIGINT, signal.SIGKILL]
+    assert [daemon.signals for daemon in daemons] == [wanted] * 2
+
+
 @pytest.mark.parametrize("number", ["SIGTERM", "SIGINT"])
 @pytest.mark.parametrize(
     "module", ["skin_host.__main__", "skin_host.cli", "skin_host.daemon.daemon", "can"]
@@ -290,6 +321,31 @@ async def test_workers_end_when_their_parent_is_killed(
     process.kill()
     await process.wait()
     await until(lambda: not any(map(is_running, children)))
+
+
+def takes(pid: int, number: signal.Signals) -> bool:
+    """Whether a process has a handler of a signal."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    caught = next(line for line in status.splitlines() if line.startswith("SigCgt:"))
+    return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
+
+
+async def test_a_service_that_ends_its_workers_itself_ends_them_in_good_order(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """systemd sends SIGTERM to all processes of a service, and their parent passes it on."""
+    config = body(tmp_path / "body.toml", [("a", [0]), ("b", [1])], mosquitto.port)
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "skin_host", "run", config, "--workers", "2"),
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    await states(mosquitto)
+    (first, _) = children_of(process.pid)
+    os.kill(first, signal.SIGTERM)
+    await until(lambda: not takes(first, signal.SIGTERM))
+    os.kill(first, signal.SIGTERM)
+    process.send_signal(signal.SIGTERM)
+    assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
 
 
 @pytest.mark.parametrize("share", ["", "-", "0/1", "2/1", "1/x", "9" * 5000])

@@ -66,6 +66,11 @@ async def test_an_answer_distinguishes_a_wrong_request_a_wrong_moment_and_a_fail
     assert (await refused(error)).cause == cause
 
 
+async def test_a_reason_is_one_line_whatever_the_request_was() -> None:
+    answer = await refused(RequestError("unknown key `x\nERROR forged\u2028\x1b[2J`"))
+    assert answer.error == "unknown key `x\\nERROR forged\\u2028\\x1b[2J`"
+
+
 @pytest.mark.parametrize(
     ("name", "payload"),
     [

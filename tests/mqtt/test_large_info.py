@@ -47,6 +47,27 @@ async def test_an_icub_is_known_through_a_broker_that_takes_256_kb(
         narrow.kill()
 
 
+async def test_contacts_go_right_behind_the_status_that_makes_them_valid(
+    mosquitto: Mosquitto,
+) -> None:
+    """On a slow link a large info would keep contacts of before at the broker for seconds."""
+    info = info_of("icub.toml")
+    async with (
+        listening(mosquitto) as seen,
+        Publisher(settings(mosquitto, discovery_prefix="skin/home"), "robot") as publisher,
+    ):
+        publisher.put_info(info)
+        for part in info.parts:
+            publisher.put_health(part, {"state": "ok"})
+            publisher.put_contact(part, "UNKNOWN")
+        await until(lambda: seen.payloads("/info") and len(seen.payloads("/health")) > 1)
+    topics = [message.topic.value.removeprefix("skin/robot/") for message in seen.messages]
+    assert topics[: 1 + len(info.parts)] == [
+        "nodes/main/status",
+        *(f"{part}/contact" for part in info.parts),
+    ]
+
+
 async def test_pieces_that_are_needed_no_longer_are_cleared(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:

@@ -59,7 +59,7 @@ MUTANTS = [
     Mutant(
         "what is retained is not sent again to a broker that forgot",
         "mqtt/outbox.py",
-        "self.pending = {topic: None for topic in self.retained if not self._is_given_up(topic)}",
+        "self.pending = {topic: None for topic in topics if not self._is_given_up(topic)}",
         "self.pending = dict(self.pending)",
     ),
     Mutant(
