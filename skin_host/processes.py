@@ -25,6 +25,8 @@ Ts = TypeVarTuple("Ts")
 AGAIN_S = 2.0
 #: A terminal sends these to all processes that were started in it: Ctrl-C, and that it is closed.
 OF_TERMINALS = (signal.SIGINT, signal.SIGHUP)
+#: Where the handlers are that asyncio sets.
+_OF_LOOPS = "asyncio.unix_events"
 #: From linux/prctl.h.
 _PR_SET_PDEATHSIG = 1
 
@@ -145,8 +147,11 @@ def kept_from_children(*numbers: signal.Signals) -> Iterator[None]:
     handlers = {}
     if threading.current_thread() is threading.main_thread():
         for number in numbers:
-            # None is a handler that Python does not know.
-            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+            before_it = signal.getsignal(number)
+            # None is a handler that Python does not know. An event loop's does nothing: the loop
+            # is woken by the signal itself, and would be a second time.
+            is_of_loop = getattr(before_it, "__module__", None) == _OF_LOOPS
+            if before_it not in (signal.SIG_IGN, None) and not is_of_loop:
                 handlers[number] = signal.signal(number, lambda number, _: came.append(number))
     try:
         yield

@@ -230,3 +230,22 @@ def test_a_signal_that_is_ignored_is_still_ignored_after_a_start() -> None:
     with kept_from_children(signal.SIGHUP):
         os.kill(os.getpid(), signal.SIGHUP)
     assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+
+
+async def test_what_an_event_loop_handles_comes_to_it_once_however_many_threads_there_are() -> None:
+    """A second request to end is one to end at once."""
+    came: list[int] = []
+    loop, ended = asyncio.get_running_loop(), threading.Event()
+    other = threading.Thread(target=ended.wait)  # it does not block the signal, and takes it
+    other.start()
+    loop.add_signal_handler(signal.SIGHUP, came.append, signal.SIGHUP)
+    try:
+        with kept_from_children(signal.SIGHUP):
+            os.kill(os.getpid(), signal.SIGHUP)
+            await asyncio.sleep(0.1)
+        await asyncio.sleep(0.1)
+    finally:
+        loop.remove_signal_handler(signal.SIGHUP)
+        ended.set()
+        other.join()
+    assert came == [signal.SIGHUP]
