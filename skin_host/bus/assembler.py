@@ -63,6 +63,7 @@ class Sweep(NamedTuple):
         crowded: it, or a part of one since the last, began within half a period of the one before,
             with a frame that was already in that: no board sends like that, but two at one address
             do.
+        unread: mask of triangles that are not configured and were sent since the sweep before.
     """
 
     board: int
@@ -72,6 +73,7 @@ class Sweep(NamedTuple):
     t_ns: int
     missed: int
     crowded: bool = False
+    unread: int = 0
 
 
 class Assembled(NamedTuple):
@@ -120,7 +122,7 @@ class _BoardState:
             which is -1 while runs are not looked for.
         begun: the frames so far, as records, of a sweep that batches divide and that came in this
             order from its first frame; their payloads are not among `values` yet.
-        crowded: see `Sweep`, since the last one that was returned.
+        crowded, unread: see `Sweep`, since the last one that was returned.
         first: the half with which the sweep began.
         usual: that of the last sweep of which no half was missing; 0 while there is none.
         lasted_ns: how long the last such sweep lasted whose frames were not taken together.
@@ -149,6 +151,7 @@ class _BoardState:
     expected: int = -1
     begun: bytes = b""
     crowded: bool = False
+    unread: int = 0
     first: int = 0
     usual: int = 0
     lasted_ns: int = 0
@@ -339,6 +342,7 @@ class Assembler:
             self.counters.other += 1
         elif not state.wanted >> (identifier & 0xF) & 1:
             self.counters.unknown_triangle += 1
+            state.unread |= 1 << (identifier & 0xF)
         else:
             if identifier >> 8 != state.classes.halves[half]:
                 self._change_classes(state, identifier >> 8, sweeps)
@@ -472,8 +476,9 @@ class Assembler:
         self.counters.sweeps += 1
         self.counters.missed += periods.note(last_ns)
         present, missed = state.awaited & _ALL_TRIANGLES, periods.missed
-        sweeps.append(Sweep(state.index, raw, status, present, last_ns, missed, state.crowded))
-        state.crowded = False
+        since = state.crowded, state.unread
+        sweeps.append(Sweep(state.index, raw, status, present, last_ns, missed, *since))
+        state.crowded, state.unread = False, 0
         state.first_ns = state.sent_first_ns = first_ns
         state.last_ns = last_ns
         return n
@@ -649,8 +654,9 @@ class Assembler:
             if triangles[:, TAXELS:].tobytes() != _NO_STATUS:
                 status = triangles[:, TAXELS:].copy().view(">u2")[:, 0].astype(np.uint16)
             t_ns, missed = state.last_ns, state.periods.missed
-            sweeps.append(Sweep(state.index, raw, status, present, t_ns, missed, state.crowded))
-            state.crowded = False
+            since = state.crowded, state.unread
+            sweeps.append(Sweep(state.index, raw, status, present, t_ns, missed, *since))
+            state.crowded, state.unread = False, 0
         state.sent = got
         state.sent_first_ns = state.first_ns
         state.missing = 0

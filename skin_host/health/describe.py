@@ -474,7 +474,7 @@ class Describer:
         """
         ledger, own = self._engine.ledger, self._layout.boards[index].settings
         sweeps: list[tuple[float, float]] = []
-        known_ms = -np.inf
+        known_ms, pause_ms = -np.inf, PAUSE_MS
         for other in self._engine.boards:
             one, row = self._layout.boards[other].settings, ledger.row[other]
             if one.bus != own.bus or one.address >= own.address:
@@ -483,14 +483,17 @@ class Describer:
             theirs_ms, took_ms = _ends_ms(ledger, row), self._sweep_ms(other)
             if theirs_ms:
                 known_ms = max(known_ms, theirs_ms[0])
-                sweeps += [(end_ms, took_ms) for end_ms in theirs_ms]
+                pause_ms = max(pause_ms, PAUSE_MS + self._unread_ms(other))
+                sweeps += [(end_ms, took_ms + self._unread_ms(other)) for end_ms in theirs_ms]
         if not sweeps:
             return False
         sweeps.sort(reverse=True)
         ends_ms, took_ms = _ends_ms(ledger, ledger.row[index]), self._sweep_ms(index)
         latest_ms = [end_ms - took_ms for end_ms in ends_ms]
         earliest_ms = [
-            _busy_since_ms(end_ms - took_ms, end_ms, sweeps) if end_ms > known_ms else -np.inf
+            -np.inf
+            if end_ms <= known_ms
+            else _busy_since_ms(end_ms - took_ms, end_ms, sweeps, pause_ms)
             for end_ms in ends_ms
         ]
         off_ms = sorted(
@@ -502,10 +505,17 @@ class Describer:
         return not off_ms or SIGMA * off_ms[3 * len(off_ms) // 4] <= JITTER_SHARE * own.period_ms
 
     def _sweep_ms(self, index: int) -> float:
-        """Return how long a board's sweep takes its bus."""
-        board = self._layout.boards[index]
-        bitrate = self._engine.settings.buses[board.settings.bus].bitrate
-        return 2 * len(board.triangles) * FRAME_BITS / bitrate * 1e3
+        """Return how long the configured triangles of a board take its bus."""
+        return self._triangle_ms(index) * len(self._layout.boards[index].triangles)
+
+    def _unread_ms(self, index: int) -> float:
+        """Return how long those take it that the board sends besides, before these or after."""
+        sweep = self._engine.ledger.last[self._engine.ledger.row[index]]
+        return 0.0 if sweep is None else self._triangle_ms(index) * sweep.unread.bit_count()
+
+    def _triangle_ms(self, index: int) -> float:
+        bus = self._layout.boards[index].settings.bus
+        return 2 * FRAME_BITS / self._engine.settings.buses[bus].bitrate * 1e3
 
     def _is_new(self, index: int) -> bool:
         """Whether a board that had timed out sends again, but no sample has its values yet, or it
@@ -629,15 +639,18 @@ def _ends_ms(ledger: BoardLedger, row: int) -> list[float]:
     return [t_ns / 1e6 for t_ns in [*before_ns.tolist(), last.t_ns]]
 
 
-def _busy_since_ms(begin_ms: float, end_ms: float, sweeps: list[tuple[float, float]]) -> float:
+def _busy_since_ms(
+    begin_ms: float, end_ms: float, sweeps: list[tuple[float, float]], pause_ms: float
+) -> float:
     """Return since when a bus passed frames without a pause until a sweep began.
 
     Args:
         begin_ms, end_ms: of the sweep.
         sweeps: others, each with its end and how long it took the bus, the last first.
+        pause_ms: after a shorter time the bus may have passed frames throughout.
     """
     for other_ms, took_ms in sweeps:
-        if other_ms < begin_ms - PAUSE_MS:
+        if other_ms < begin_ms - pause_ms:
             break
         if other_ms <= end_ms:
             begin_ms = min(begin_ms, other_ms) - took_ms

@@ -70,6 +70,15 @@ def test_strangers_are_counted():
     assert assembler.counters.unknown_triangle == 4
 
 
+def test_a_sweep_has_the_triangles_that_were_sent_since_the_one_before_and_are_not_configured():
+    assembler = make("0,2")
+    first, second, third = (
+        feed(assembler, frames(values(n), number * PERIOD)) + assembler.flush()
+        for number, n in enumerate((4, 4, 3), 1)
+    )
+    assert [sweep.unread for sweep in first + second + third] == [0b0010, 0b1010, 0b1010]
+
+
 def test_boards_that_another_node_reads_are_no_strangers():
     assembler = make("0-1", boards=2, mine=1)
     sent = frames(values(2), PERIOD) + frames(values(2), PERIOD, board=2)

@@ -7,6 +7,7 @@ import pytest
 
 from emulator.probes.scene import Fault, Place, Probe, Scene
 from emulator.robot import Robot
+from skin_host.bus.commands import SetTriangleConfig
 from skin_host.bus.ledger import MOST_OFTEN
 from skin_host.bus.wire import FrameBatch
 from skin_host.health import LATELY_NS, STALLED_NS, HealthWatch
@@ -83,6 +84,23 @@ def test_a_board_that_one_held_up_which_is_silent_now_is_not_called_irregular() 
     for _ in range(10):
         bench.run(0.1)
         assert "board_jitter" not in {code for code, _ in bench.told}
+
+
+def test_boards_that_wait_for_triangles_that_are_not_configured_are_not_called_irregular() -> None:
+    """A board that another program set up sends all sixteen, which takes the bus longer."""
+    bench = FaultBench(2.0, config=CONFIG.with_name("kaspar.toml"), settle_s=2.0)
+    hand = bench.layout.boards[1]
+    assert hand.triangles == tuple(range(6))
+    bench.robot._command(1, SetTriangleConfig(0, 15))
+    bench.robot._boards[1].next_ns += 7_000_000  # it sends where the others have begun
+    bench.robot._look_ahead()
+    bench.run(3.0)
+    bench.inject("jittered_period", board="right_lower_arm", value=8.0)
+    irregular = set()
+    for _ in range(60):
+        bench.run(0.25)
+        irregular |= {where for code, where in bench.told if code == "board_jitter"}
+    assert irregular == {"right_lower_arm"}
 
 
 def test_an_irregular_board_that_more_urgent_ones_hide_is_not_known() -> None:
