@@ -44,24 +44,21 @@ test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, systemd, broker
 	@$(BIN)/python -m compileall -q skin_host emulator tests
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target test-real-time test-beside
 
-# What runs in real time, mostly waiting, and beside it what computes, which gives way to it, and
-# other machines.
+# What runs in real time, and beside it what computes, which gives way to it, and other machines.
 test-real-time: test-native
 	@tools/timed "on this host: the other tests with a broker" \
 		$(BIN)/python -m pytest tests -m mosquitto --hypothesis-profile=far \
 		--require-mosquitto $(BY_FILE) $(AGAIN)
 	@$(MAKE) --no-print-directory test-lane
-	@$(MAKE) --no-print-directory test-containers
 
 test-beside: test-long
-	@tools/timed "a Debian that boots: its disk" tools/lane/debian
+	@$(MAKE) --no-print-directory test-containers
 	@tools/timed "a Debian that boots: systemd and CAN cards" \
 		$(BIN)/python -m pytest tests/system/systemd --numprocesses=2 --dist=loadfile $(AGAIN)
 
 test-native: .venv/dev.stamp .venv/fuzz.stamp
 	@tools/timed "on this host: broker, browser, the lane itself" \
-		$(BIN)/python -m pytest tests/system/native --require-mosquitto \
-		--numprocesses=2 --dist=loadfile --no-loadscope-reorder $(AGAIN)
+		$(BIN)/python -m pytest tests/system/native --require-mosquitto $(AGAIN)
 
 test-long: .venv/dev.stamp
 	@tools/timed "on this host: what computes for long" nice -n 19 \
@@ -74,6 +71,7 @@ test-lane: .venv/dev.stamp
 		--bus=vcan --require-mosquitto -o faulthandler_timeout=300 $(AGAIN)
 
 test-containers: .venv/dev.stamp
+	@tools/timed "a Debian that boots: its disk" tools/lane/debian
 	@tools/timed "containers: the image is built, it and the compose file run" \
 		tools/lane/image $(BIN)/python -m pytest tests/system/containers $(AGAIN)
 

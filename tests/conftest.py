@@ -23,8 +23,6 @@ _numbers = itertools.count()
 BROKERS = {"mosquitto", "world"}
 #: Files that take longest, by the clock or by the processor.
 LONGEST_FIRST = (
-    "tests/system/native/test_page.py",
-    "tests/system/native/test_acquisition.py",
     "tests/evaluation/simulate/test_simulate.py",
     "tests/processing/test_long_contact.py",
     "tests/attacks/test_hostile_bus.py",

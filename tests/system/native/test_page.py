@@ -626,9 +626,10 @@ async def test_what_is_at_the_cursor_stands_beside_it_under_a_banner(
         await seen.run("window.sockets.at(-1).onclose()")
         high = await seen.until('document.getElementById("banner").offsetHeight')
         assert high > 30
+        # A slow browser draws the map some more times before that has its new place.
         draws = await seen.run("Number(document.body.dataset.draws)")
         await seen.until(f"Number(document.body.dataset.draws) > {draws} + 2")
-        assert await seen.run(below) == pytest.approx(before, abs=high / 2)
+        await seen.until(f"Math.abs({below} - {before}) < {high / 2}")
 
 
 async def test_what_is_old_when_the_page_opens_is_not_shown_as_present(
