@@ -55,9 +55,10 @@ KINDS: dict[str, Begin] = {
     "stuck_taxel": emulated(
         "stuck_taxel", {"taxel_stuck", "taxel_unproven"}, {"taxel_stuck"}, 20, spoils=True
     ),
+    # With noise of many units it reads far out of range now and then.
     "noisy_taxel": emulated(
         "noisy_taxel",
-        {"taxel_noisy", "taxel_unproven", "bus_bit_errors", *CALIBRATED},
+        {"taxel_noisy", "taxel_unproven", "taxel_out_of_range", "bus_bit_errors", *CALIBRATED},
         {"taxel_noisy"},
         4.0,
         spoils=True,
