@@ -42,11 +42,11 @@ def open_port(
     opening: Future[can.BusABC] | None = None
     try:
         if bus.interface == "socketcan":
-            opened = open_bus(name, bus)
+            opened = socketcan.open_checked(name, bus)
         else:
             # In a thread: some libraries wait for ever for what does not answer.
             worker = clock.executor(f"adapter-{name}")
-            opening = worker.submit(open_bus, name, bus)
+            opening = worker.submit(adapters.open_bus, name, bus)
             opened = _opened(name, bus, opening)
     except SkinError as error:
         if not wait or not isinstance(error, BusError):

@@ -480,11 +480,12 @@ class Describer:
             if one.bus != own.bus or one.address >= own.address:
                 continue
             # One that is silent now has held up what was sent before.
-            theirs_ms, took_ms = _ends_ms(ledger, row), self._sweep_ms(other)
+            theirs_ms, unread_ms = _ends_ms(ledger, row), self._unread_ms(other)
             if theirs_ms:
                 known_ms = max(known_ms, theirs_ms[0])
-                pause_ms = max(pause_ms, PAUSE_MS + self._unread_ms(other))
-                sweeps += [(end_ms, took_ms + self._unread_ms(other)) for end_ms in theirs_ms]
+                pause_ms = max(pause_ms, PAUSE_MS + unread_ms)
+                took_ms = self._sweep_ms(other) + unread_ms
+                sweeps += [(end_ms, took_ms) for end_ms in theirs_ms]
         if not sweeps:
             return False
         sweeps.sort(reverse=True)

@@ -306,16 +306,22 @@ def is_running(pid: int) -> bool:
         return False
 
 
-async def test_workers_end_when_their_parent_is_killed(
-    mosquitto: Mosquitto, tmp_path: Path
-) -> None:
-    """They would go on commanding the boards beside those of the next start."""
+async def two_workers(mosquitto: Mosquitto, tmp_path: Path) -> asyncio.subprocess.Process:
+    """Start a robot of two workers, and wait until both have published their states."""
     config = body(tmp_path / "body.toml", [("a", [0]), ("b", [1])], mosquitto.port)
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "skin_host", "run", config, "--workers", "2"),
         stderr=asyncio.subprocess.DEVNULL,
     )
     await states(mosquitto)
+    return process
+
+
+async def test_workers_end_when_their_parent_is_killed(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """They would go on commanding the boards beside those of the next start."""
+    process = await two_workers(mosquitto, tmp_path)
     children = children_of(process.pid)
     assert len(children) == 2
     process.kill()
@@ -334,12 +340,7 @@ async def test_a_service_that_ends_its_workers_itself_ends_them_in_good_order(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
     """systemd sends SIGTERM to all processes of a service, and their parent passes it on."""
-    config = body(tmp_path / "body.toml", [("a", [0]), ("b", [1])], mosquitto.port)
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "skin_host", "run", config, "--workers", "2"),
-        stderr=asyncio.subprocess.DEVNULL,
-    )
-    await states(mosquitto)
+    process = await two_workers(mosquitto, tmp_path)
     (first, _) = children_of(process.pid)
     os.kill(first, signal.SIGTERM)
     await until(lambda: not takes(first, signal.SIGTERM))

@@ -282,13 +282,14 @@ def find_lag(median_units: Floats, time_s: Floats, table: tuple[Floats, Floats])
     misfit = _misfit(fine, np.interp(fine, time_s, median_units), table)
     tried = near + np.arange(-2.0, 2.0 + 0.5 * LAG_STEP_S, LAG_STEP_S)
     lag_s = float(min(tried, key=misfit))
-    if misfit(lag_s) > RATED_KPA**2:
+    error = misfit(lag_s)
+    if error > RATED_KPA**2:
         roughly = _misfit(coarse, units, table)
         some = itertools.product(lags, RATES)
         some_lag, some_rate = min(some, key=lambda clock: roughly(*clock))
         around = itertools.product(some_lag + RATE_LAGS_S, some_rate + RATE_STEPS)
         least, rate = min((misfit(*clock), float(clock[1])) for clock in around)
-        if abs(rate) > MOST_RATE and least < RATED_SHARE * misfit(lag_s):
+        if abs(rate) > MOST_RATE and least < RATED_SHARE * error:
             raise RequestError(
                 f"the table's clock runs {abs(rate):.1%} {'fast' if rate > 0.0 else 'slow'}, and "
                 "that of the recording does not; wanted the same: are its times counted in samples "
