@@ -6,7 +6,6 @@ Unknown keys, wrong types, wrong lengths and references to nothing are errors th
 name the file and the path inside it. `docs/configuration.md` explains every key.
 """
 
-import codecs
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -369,7 +368,7 @@ def read_toml(path: Path, table: type[T], named: Named) -> T:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
     try:
         # Editors of other systems begin a text with a mark of its coding.
-        document = msgspec.toml.decode(data.removeprefix(codecs.BOM_UTF8))
+        document = msgspec.toml.decode(data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         raise ConfigurationError(f"{path}: not TOML: {error}; save it as UTF-8") from None
     except msgspec.DecodeError as error:

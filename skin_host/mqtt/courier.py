@@ -29,7 +29,7 @@ from skin_host.mqtt.connection import (
     within,
 )
 from skin_host.mqtt.frames import encode_frame
-from skin_host.mqtt.outbox import Outbox
+from skin_host.mqtt.outbox import Outbox, State
 from skin_host.mqtt.packets import publish_head, publish_packet
 from skin_host.mqtt.topics import Topics
 from skin_host.mqtt.trials import REJECTIONS
@@ -275,18 +275,23 @@ class Courier:
             self.too_large.pop(event.topic, None)  # whoever asks may name another one each time
 
     async def _try_alone(self, connection: Connection) -> None:
-        """Send suspected messages, one at a time, after the others."""
+        """Send suspected messages, one at a time.
+
+        Before the suspected events go the status and all contacts: the status makes valid what the
+        broker retained of these, however old it is.
+        """
         outbox = self._outbox
         if self._events_alone or self._states_alone or self._frames_alone:
-            status = {self._status: outbox.retained[self._status]}
-            sent = self._send_state(connection, self._status, status[self._status].payload)
-            if sent is not None:
-                self._states_out[self._status] = sent
-                await within(TIMEOUT_S, sent)
-                del self._states_out[self._status]
-                outbox.states_sent(status)
-                self._works = True
+            await self._send_batch(connection, {self._status: outbox.retained[self._status]})
             self._states_alone.pop(self._status, None)
+            due = outbox.take_states(len(outbox.pending))
+            contacts = [topic for topic in due if self._is_contact(topic)]
+            suspected = [topic for topic in contacts if topic in self._states_alone]
+            others = [topic for topic in contacts if topic not in self._states_alone]
+            for start in range(0, len(others), RETAINED_WINDOW):
+                topics = others[start : start + RETAINED_WINDOW]
+                await self._send_batch(connection, {one: outbox.retained[one] for one in topics})
+            await self._try_states(connection, suspected)
         while self._events_alone and outbox.events:
             event = outbox.events[0]
             if not self._fits(connection, event.topic, event.payload, event.properties):
@@ -300,22 +305,23 @@ class Courier:
             outbox.event_sent()
             self._events_alone -= 1
         self._events_alone = 0
-        while self._states_alone:
-            topic = next(iter(self._states_alone))
-            states = {topic: outbox.retained[topic]}
-            sent = self._send_state(connection, topic, states[topic].payload)
-            if sent is not None:
-                self._states_out[topic] = sent
-                await within(TIMEOUT_S, sent)
-                del self._states_out[topic]
-                outbox.states_sent(states)
-            del self._states_alone[topic]
+        await self._try_states(connection, list(self._states_alone))
         if self._frames_alone:
             try:
                 async with self._clock.timeout(FRAME_PATIENCE_S):
                     await self._try_frames(connection)
             except TimeoutError:  # some parts send none
                 self._frames_alone.clear()
+
+    async def _try_states(self, connection: Connection, topics: list[str]) -> None:
+        """Send these suspected states, one at a time."""
+        for topic in topics:
+            await self._send_batch(connection, {topic: self._outbox.retained[topic]})
+            del self._states_alone[topic]
+
+    def _is_contact(self, topic: str) -> bool:
+        subject = self._topics.parse(topic)
+        return subject is not None and subject.kind == "contact"
 
     async def _try_frames(self, connection: Connection) -> None:
         """Send one frame of each suspected part, with QoS 1: an acknowledgement clears it."""
@@ -461,19 +467,23 @@ class Courier:
                     await outbox.retained_put.wait()
             outbox.retained_put.clear()
             while states := outbox.take_states(RETAINED_WINDOW):
-                for topic, state in list(states.items()):
-                    sent = self._send_state(connection, topic, state.payload)
-                    if sent is None:
-                        outbox.give_up_state(topic)
-                        del states[topic]
-                    else:
-                        self._states_out[topic] = sent
-                for done in self._states_out.values():
-                    await within(TIMEOUT_S, done)
-                self._states_out.clear()
-                self._works = True
-                outbox.states_sent(states)
+                await self._send_batch(connection, states)
                 self._after_states(connection)
+
+    async def _send_batch(self, connection: Connection, states: dict[str, State]) -> None:
+        """Send states together, and wait until all have arrived but those that are too large."""
+        for topic, state in list(states.items()):
+            sent = self._send_state(connection, topic, state.payload)
+            if sent is None:
+                self._outbox.give_up_state(topic)
+                del states[topic]
+            else:
+                self._states_out[topic] = sent
+        for done in self._states_out.values():
+            await within(TIMEOUT_S, done)
+        self._works = self._works or bool(self._states_out)
+        self._states_out.clear()
+        self._outbox.states_sent(states)
 
     def _send_state(
         self, connection: Connection, topic: str, payload: bytes

@@ -471,6 +471,55 @@ async def test_of_several_touches_on_their_way_the_rejected_one_is_found_one_at_
 
 
 @stepped
+async def test_contacts_go_before_suspected_touches_which_take_a_round_trip_each(
+    clock: SteppedClock,
+) -> None:
+    """The status makes valid what the broker retained of contacts."""
+    sender = Sender(clock)
+    contacts = [TOPICS.part("contact", part) for part in ("palm", "arm")]
+    for topic in contacts:
+        sender.outbox.put_state(topic, b"OFF")
+    sender.put_touches([1, 2])
+    async with sender.over(Link(is_prompt=True)):  # the broker has stored them
+        pass
+    sender.put_touches([3, 4])
+    assert await sender.rejected() is None
+    for topic in contacts:
+        sender.outbox.put_state(topic, b"ON")
+    sender.outbox.repeat_states([STATUS, *contacts])
+    link = Link()
+    async with sender.over(link):
+        link.acknowledge(link.waiting(STATUS))
+        await sender.turn()
+        assert [(one.topic, one.payload) for one in link.waiting()] == [
+            (topic, b"ON") for topic in contacts
+        ]
+        link.acknowledge(link.waiting())
+        await sender.turn()
+        assert [one.number for one in link.waiting()] == [3]
+
+
+@stepped
+async def test_suspected_contacts_go_one_at_a_time_before_suspected_touches(
+    clock: SteppedClock,
+) -> None:
+    sender = Sender(clock)
+    contacts = [TOPICS.part("contact", part) for part in ("palm", "arm")]
+    sender.outbox.put_state("state", b"")
+    for topic in contacts:
+        sender.outbox.put_state(topic, b"ON")
+    sender.put_touches([1, 2])
+    assert await sender.rejected() is None
+    went, link = [], Link()
+    async with sender.over(link):
+        while waiting := link.waiting():
+            went.append([one.topic for one in waiting])
+            link.acknowledge(waiting)
+            await sender.turn()
+    assert went == [[STATUS], *[[topic] for topic in contacts], [TOUCHES], [TOUCHES], ["state"]]
+
+
+@stepped
 async def test_a_connection_that_never_worked_or_that_we_lost_accuses_no_message(
     clock: SteppedClock,
 ) -> None:
