@@ -184,13 +184,16 @@ def _bus(bus: BusHealth) -> Iterator[FoundFault]:
             f": frames of other devices take {recent['other_load']:.0%} of it{mostly}; find the "
             "node that sends them",
         )
+    lost = []
     if recent["dropped"]:
-        yield fault(
-            "bus_drops",
-            f": this computer lost {recent['dropped']} frames in the last second; "
-            "see docs/receive.md",
-        )
-    if recent["halves"] >= FEW_HALVES:
+        lost.append(f"this computer lost {recent['dropped']} frames in the last second")
+    if recent["overflows"]:
+        times = f"{recent['overflows']} times in the last second"
+        lost.append(f"its controller, or the driver of that, lost frames {times}")
+    if lost:
+        yield fault("bus_drops", f": {', and '.join(lost)}; see docs/receive.md")
+    # Of frames that were lost here, others are lone.
+    if recent["halves"] >= FEW_HALVES and not bus.get("lost_here"):
         why = "the bus is overloaded or badly terminated"
         if recent["load"] >= FULL_LOAD:
             why = f"the bus is overloaded: its load is {recent['load']:.0%}"
@@ -206,11 +209,12 @@ def _bus(bus: BusHealth) -> Iterator[FoundFault]:
             f"second, single bytes of {spiked_pads} pads off in the last ten); suspect a gateway "
             "or an adapter",
         )
-    if recent["error_frames"] and state == "up":
+    # A controller that lost frames reports that in one as well.
+    errors = recent["error_frames"] - recent["overflows"]
+    if errors > 0 and state == "up":
         yield fault(
             "bus_errors",
-            f": {recent['error_frames']} error frames in the last second; "
-            "check wiring and termination",
+            f": {errors} error frames in the last second; check wiring and termination",
         )
     for address, kind in sorted(bus.get("strangers", {}).items()):
         what = f": a board of type {kind} at address {address} is not in the configuration"
@@ -377,7 +381,9 @@ def _taxels(record: Record) -> Iterator[FoundFault]:
             saturated,
             "rest so near 0 that a press is cut off; set the boards up again, then calibrate",
         )
-    if touched := verdicts.get("touched"):
+    # A calibration leaves stuck pads out.
+    stuck = record["taxel_faults"].get("stuck", ())
+    if touched := [taxel for taxel in verdicts.get("touched", ()) if taxel not in stuck]:
         yield fault(
             "taxel_pressed", touched, "touched when calibrated; calibrate when nothing touches"
         )

@@ -129,6 +129,17 @@ def test_a_taxel_that_the_calibration_refused_is_told(bench: FaultBench) -> None
     assert "taxel 5 of left_hand" in faults["taxel_refused"].sentence
 
 
+def test_who_reads_that_a_pad_is_stuck_is_not_asked_to_calibrate_it(bench: FaultBench) -> None:
+    """A calibration leaves it out, so what the last one found of it would stand for ever."""
+    record = bench.records["left_hand"] | {"taxel_verdicts": {"touched": [5, 6]}}
+    stuck = record | {"taxel_faults": {"stuck": [5]}, "invalid": [5]}
+    faults = {fault.code: fault for fault in diagnose(stuck)}
+    assert faults["taxel_stuck"].sentence.startswith("taxel 5 of left_hand")
+    assert faults["taxel_pressed"].sentence.startswith("taxel 6 of left_hand")
+    stuck = record | {"taxel_faults": {"stuck": [5, 6]}, "invalid": [5, 6]}
+    assert "taxel_pressed" not in {fault.code for fault in diagnose(stuck)}
+
+
 def test_the_new_zero_of_a_board_is_found_by_itself(bench: FaultBench) -> None:
     """The zero is one noisy snapshot; without finding it anew some taxels would be touched."""
     bench.inject("chip_gone", **HERE, value=0)
