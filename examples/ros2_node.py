@@ -7,11 +7,16 @@ import sys
 from functools import cache, partial
 
 import numpy as np
-import rclpy
-from geometry_msgs.msg import WrenchStamped
-from std_msgs.msg import Float32MultiArray
 
 from skin_host.client import Contact, Frame, SkinCallbacks, SkinError, Touch
+
+try:
+    import rclpy
+    from geometry_msgs.msg import WrenchStamped
+    from rclpy.executors import ExternalShutdownException
+    from std_msgs.msg import Float32MultiArray
+except ModuleNotFoundError as error:
+    sys.exit(f"{error}: wanted ROS 2, such as by `source /opt/ros/humble/setup.bash`")
 
 rclpy.init()
 node = rclpy.create_node("skin")
@@ -71,10 +76,12 @@ def publish_wrench(part: str) -> None:
 
 
 try:
-    with SkinCallbacks(*sys.argv[1:]) as skin:
+    with SkinCallbacks(*sys.argv[1:2]) as skin:
         skin.on_frame(on_frame)
         skin.on_contact(on_contact)
         skin.on_touch(on_touch)
         rclpy.spin(node)
 except SkinError as error:  # no broker, or no robot there
     sys.exit(str(error))
+except (KeyboardInterrupt, ExternalShutdownException):
+    pass

@@ -14,7 +14,7 @@ def on_contact(contact: Contact) -> None:
         print("move", flush=True)
 
 
-if len(sys.argv) < 2 or "/" in sys.argv[1]:  # which a URL has, and the name of no part
+if len(sys.argv) not in (2, 3) or "/" in sys.argv[1]:  # which a URL has, and the name of no part
     sys.exit("which part? python examples/stop_on_touch.py PART [URL]")
 for ends in (signal.SIGTERM, signal.SIGHUP):  # else the motor would not be stopped then
     signal.signal(ends, lambda number, _: sys.exit(128 + number))

@@ -16,10 +16,12 @@ from importlib.util import find_spec
 
 import can
 import numpy as np
+from numpy.typing import NDArray
 
 from skin_host.bus.port import (
     ERROR_FLAG,
     EXTENDED_FLAG,
+    NO_ROOM,
     PLAUSIBLE_S,
     REMOTE_FLAG,
     SEND_DEADLINE_S,
@@ -28,7 +30,13 @@ from skin_host.bus.port import (
     Port,
     one_line,
 )
-from skin_host.bus.wire import MAX_EXTENDED_ID, FrameBatch
+from skin_host.bus.wire import (
+    HEADER_A,
+    HEADER_B,
+    MAX_EXTENDED_ID,
+    FrameBatch,
+    MessageClass,
+)
 from skin_host.clock import SYSTEM, Clock, Executor
 from skin_host.config.settings import Bus
 from skin_host.errors import BusError, ConfigurationError
@@ -39,6 +47,9 @@ MULTICAST = "udp_multicast"
 SOCKETCAND = "socketcand"
 #: They take a frame at once, or never, and stamp it by this computer's clock.
 AT_ONCE = ("virtual", MULTICAST)
+#: Their error frames have the kernel's classes and details. Those of other libraries mean other
+#: things by the same bits, such as the kind and the place of a bit error.
+KERNELS_ERRORS = frozenset({"virtual", MULTICAST, SOCKETCAND, "gs_usb", "serial"})
 #: What so many times in a row could not be read shows that the library does not get past it.
 MOST_UNREADABLE = 8
 #: A serial adapter's line is shorter than this; noise never ends one.
@@ -46,6 +57,17 @@ LONGEST_LINE = 4096
 #: Clocks that differ by less are the same. Within so long some frame is read at once.
 SAME_S = 0.002
 FRESH_S = 2.0
+#: Their libraries stamp a frame when they are asked for it.
+STAMPED_WHEN_READ = frozenset({"iscan", "neousys", "robotell", "seeedstudio", "slcan"})
+#: No frame takes a shorter time on the bus. Reads are planned to be so far apart at most.
+FRAME_NS = 111_000
+LONGEST_NS = 30_000_000
+#: A clock that is not known yet is one if it differs by the same in two times of this length, one
+#: after the other, to within so much.
+PROOF_S = 1.0
+STEADY_S = 0.02
+#: The time of day was set where it has moved so much more than the time since the computer's start.
+CLOCK_SET_NS = 100_000_000
 #: Frames that come from a queue that has not been empty for longer than this have waited.
 BACKLOG_S = 0.1
 #: Opening may take so long: a serial adapter takes 2 s. Closing is waited for this long.
@@ -113,6 +135,10 @@ class Stamps:
     differs by a tenth of a period would make whole sweeps look cut, or boards as if they had
     sent in the future. A single stamp that is ahead may be damaged: two in a row show the clock.
     Frames that waited because this computer is too busy to read them in time show nothing of it.
+
+    A clock that is far from the known one, at first the time of day, counts from the adapter's
+    start, has begun again, or this computer's was set. It has to show that it is one: stamps that
+    stand still, jump or are no numbers do not.
     """
 
     def __init__(self) -> None:
@@ -121,16 +147,39 @@ class Stamps:
         self._since_s = -math.inf
         self._least_s = math.inf
         self._emptied_s = math.inf
+        #: By how much another clock than the known one differs at least, since a moment, and in the
+        #: time before that.
+        self._other_s = math.inf
+        self._other_since_s = -math.inf
+        self._other_before_s = math.inf
+        #: By how much one differs that has shown to be a clock.
+        self._shown_s: float | None = None
 
     def note_empty(self, now_s: float) -> None:
         """No more frames wait to be read."""
         self._emptied_s = now_s
+        # Not before: a frame of the same read would seem to be older than the one before it.
+        if self._shown_s is not None:
+            self._behind_s, self._shown_s = self._shown_s, None
+            self._since_s, self._least_s = now_s, math.inf
 
-    def here(self, stamp_s: float, now_s: float) -> float:
-        """Return the time on this computer's clock of a frame that is read now."""
-        if not abs(stamp_s - now_s) <= PLAUSIBLE_S:
-            return now_s
+    def clock_set(self, step_s: float) -> None:
+        """Note that this computer's clock was set, and the adapter's was not.
+
+        That it was set back the next two frames show: they seem to be of the future.
+        """
+        self._behind_s += max(step_s, 0.0)
+
+    def here(self, stamp_s: float, now_s: float) -> float | None:
+        """Return the time on this computer's clock of a frame that is read now; None if its stamp
+        is not of a known clock.
+        """
         differs_s = now_s - stamp_s
+        if not abs(differs_s - self._behind_s) <= PLAUSIBLE_S:
+            self._note_other(differs_s, now_s)
+            return None
+        if self._other_s < math.inf:
+            self._other_s = self._other_before_s = math.inf
         before_s, self._before_s = self._before_s, differs_s
         waited_s = differs_s - self._behind_s
         if now_s - self._emptied_s <= BACKLOG_S:
@@ -145,6 +194,58 @@ class Stamps:
             self._behind_s = min(self._behind_s, max(differs_s, before_s))
             return now_s
         return now_s - waited_s
+
+    def _note_other(self, differs_s: float, now_s: float) -> None:
+        """Note a stamp of another clock than the known one, if it is of a clock."""
+        if not 0 <= now_s - self._other_since_s < PROOF_S:
+            if abs(self._other_s - self._other_before_s) <= STEADY_S:
+                self._shown_s = self._other_s
+            self._other_before_s, self._other_s = self._other_s, math.inf
+            self._other_since_s = now_s
+        self._other_s = min(self._other_s, differs_s)
+
+
+class Reads:
+    """Dates frames of which no more is known than when they were read.
+
+    A board that a read finds in the middle of its sweep goes on at once: what comes up to its last
+    frame followed without a pause. By the time of the next read, half a period later, its sweep
+    would be cut, and the bus and the board would be accused.
+    """
+
+    def __init__(self) -> None:
+        #: The halves that each board had sent of a sweep when all had been read, and that time.
+        self._sent: dict[int, set[int]] = {}
+        self._emptied_ns = 0
+
+    def note_empty(self, now_ns: int) -> None:
+        """No more frames wait to be read."""
+        self._emptied_ns = now_ns
+
+    def date(
+        self, identifier: NDArray[np.uint32], header: NDArray[np.uint8], t_ns: NDArray[np.int64]
+    ) -> None:
+        """Date the frames of a read [n]; `t_ns` are the times at which they were read."""
+        before, self._sent = self._sent, {}
+        end = 0
+        heads = zip(identifier.tolist(), header.tolist(), strict=True)
+        for row, (number, first) in enumerate(heads):
+            if number >> 8 != MessageClass.SKIN_STREAM or first not in (HEADER_A, HEADER_B):
+                continue
+            board, half = number >> 4, number << 8 | first
+            sent = before.get(board)
+            if sent is not None and half not in sent:
+                end = row + 1
+            else:
+                before.pop(board, None)
+                sent = self._sent.setdefault(board, set())
+                if half in sent:
+                    sent.clear()  # another sweep begins
+            sent.add(half)
+            self._sent[board] = sent
+        if end and 0 < t_ns[end - 1] - self._emptied_ns <= LONGEST_NS:
+            soonest_ns = self._emptied_ns + FRAME_NS * np.arange(1, end + 1)
+            t_ns[:end] = np.minimum(t_ns[:end], soonest_ns)
 
 
 class AdapterPort(Port):
@@ -175,6 +276,9 @@ class AdapterPort(Port):
         self._opening_since_s = self._clock.monotonic_s()
         self._unreadable = 0
         self._stamps = Stamps()
+        self._reads = Reads()
+        self._unstamped = 0
+        self._started_at_ns = self._now_started_at_ns()
         self._id = np.zeros(CAPACITY, np.uint32)
         self._dlc = np.zeros(CAPACITY, np.uint8)
         self._data = np.zeros((CAPACITY, 8), np.uint8)
@@ -183,6 +287,11 @@ class AdapterPort(Port):
     def read(self) -> FrameBatch:
         n = 0
         errors = False
+        self._unstamped = 0
+        emptied_ns: int | None = None
+        before_ns, self._started_at_ns = self._started_at_ns, self._now_started_at_ns()
+        if self._started_at_ns - before_ns >= CLOCK_SET_NS:
+            self._stamps.clock_set((self._started_at_ns - before_ns) * 1e-9)
         if self._bus is None:
             self._look_for_device()
         else:
@@ -190,7 +299,8 @@ class AdapterPort(Port):
                 for _ in range(CAPACITY):
                     message = self._receive(self._bus)
                     if message is None:
-                        self._stamps.note_empty(self._clock.now_ns() * 1e-9)
+                        emptied_ns = self._clock.now_ns()
+                        self._stamps.note_empty(emptied_ns * 1e-9)
                         break
                     if self._put(n, message):
                         errors |= bool(message.is_error_frame)
@@ -202,6 +312,12 @@ class AdapterPort(Port):
                 self._note_failure(error)
         self.counters.frames += n
         batch = FrameBatch(self._id[:n], self._dlc[:n], self._data[:n], self._t_ns[:n])
+        if n:
+            self.stamps_late = self._settings.interface in AT_ONCE or self._unstamped > 0
+        if n == self._unstamped:
+            self._reads.date(batch.id, batch.data[:, 0], batch.t_ns)
+        if emptied_ns is not None:
+            self._reads.note_empty(emptied_ns)
         if errors:
             self._note_errors(batch)
         elif n:
@@ -209,6 +325,10 @@ class AdapterPort(Port):
         if self.state is not self._logged_state:
             self._log_state()
         return batch
+
+    def _now_started_at_ns(self) -> int:
+        """Return the time of day at which this computer was started, by the present clock."""
+        return self._clock.now_ns() - self._clock.since_boot_ns()
 
     def _note_calm(self) -> None:
         # Not every adapter reports the end of this, and over multicast anybody can send an error.
@@ -231,11 +351,6 @@ class AdapterPort(Port):
         try:
             async with self._clock.timeout(SEND_DEADLINE_S):
                 await asyncio.wrap_future(sending)
-        except ConnectionError as error:
-            # A library may read the end of a connection as no frame: only sending shows it.
-            if self._bus is bus:
-                self._note_failure(error)
-            raise
         except TimeoutError:
             if sending.done() and not sending.cancelled():
                 raise  # the library's own
@@ -244,6 +359,12 @@ class AdapterPort(Port):
                 self._note_failure(BusError(why))
                 self._worker = None  # it may wait for ever
             raise BusError(why) from None
+        except (can.CanError, OSError) as error:
+            # A library may read the end of a connection, or an adapter that was unplugged, as no
+            # frame: only sending shows it.
+            if self._bus is bus and _is_failure(error):
+                self._note_failure(error)
+            raise
 
     def _in_order(self) -> Executor:
         """Return the thread for what may block."""
@@ -290,7 +411,8 @@ class AdapterPort(Port):
     def _wanted(self, message: can.Message) -> bool:
         # python-can's own filters are not used: with a filter, `recv(0)` returns None for a frame
         # that does not pass, even if others wait.
-        if message.is_fd:
+        # Some libraries return what was sent, too.
+        if message.is_fd or not message.is_rx:
             return False
         return (
             not self._settings.skin_only
@@ -307,16 +429,24 @@ class AdapterPort(Port):
             if len(message.data) != message.dlc and not message.is_remote_frame:
                 raise ValueError("a frame that was cut")
             self._id[row] = identifier(message)
+            if message.is_error_frame and self._settings.interface not in KERNELS_ERRORS:
+                self._id[row] = ERROR_FLAG
             self._dlc[row] = message.dlc
             # Nothing of an earlier frame remains behind this one's bytes.
             self._data[row] = bytearray(message.data).ljust(8, b"\0")
         except (TypeError, ValueError, OverflowError):  # cut; numbers of other types, out of range
             self.counters.damaged += 1
             return False
-        self._t_ns[row] = nanoseconds(self._time_of(message, self._clock.now_ns() * 1e-9))
+        now_ns = self._clock.now_ns()
+        time_s = self._time_of(message, now_ns * 1e-9)
+        self._unstamped += time_s is None
+        self._t_ns[row] = now_ns if time_s is None else nanoseconds(time_s)
         return True
 
-    def _time_of(self, message: can.Message, now_s: float) -> float:
+    def _time_of(self, message: can.Message, now_s: float) -> float | None:
+        """Return when a frame came; None if no more is known than that it is read now."""
+        if self._settings.interface in STAMPED_WHEN_READ:
+            return None
         if self._settings.interface not in AT_ONCE:
             return self._stamps.here(message.timestamp, now_s)
         is_time = abs(message.timestamp - now_s) <= PLAUSIBLE_S
@@ -342,10 +472,21 @@ class AdapterPort(Port):
                 self.note_unopened(error)
                 return
             self._bus = opening.result()
+            self._stamps = Stamps()  # its clock may have begun again
             self.counters.reopened += 1
             self._enter(LinkState.UP)
         elif not self.unopened and self._clock.monotonic_s() - self._opening_since_s >= OPEN_S:
             self.note_unopened(no_answer(self.name, self._settings))
+
+
+def _is_failure(error: Exception) -> bool:
+    """Whether an error of sending is that of the adapter, or of its connection: it does not only
+    lack room, as on a bus where no node acknowledges.
+    """
+    code = error.errno if isinstance(error, OSError) else getattr(error, "error_code", None)
+    if code is None and isinstance(error.__cause__, OSError):
+        code = error.__cause__.errno
+    return isinstance(error, ConnectionError) or code not in NO_ROOM
 
 
 def no_answer(name: str, settings: Bus) -> BusError:

@@ -219,6 +219,11 @@ class Assembler:
         closes_ns = [state.periods.close_ns for state in self._states.values()]
         self._longest_close_ns = max(closes_ns, default=0)
 
+    @property
+    def elsewhere(self) -> int:
+        """How many of the other frames are of boards that another node reads."""
+        return self._forms.elsewhere
+
     def feed(self, batch: FrameBatch) -> Assembled:
         """Process the frames of a batch; this is the only loop over them."""
         # One frame after the other: for the thirty to hundred frames of a read, this costs less

@@ -125,6 +125,7 @@ class FrameForms:
 
     Attributes:
         unconfigured: frames of the skin stream by address of a board that is not configured.
+        elsewhere: how many of the other frames are of boards that another node reads.
     """
 
     def __init__(
@@ -135,6 +136,7 @@ class FrameForms:
         force_torque: frozenset[int],
     ) -> None:
         self.unconfigured: Counter[int] = Counter()
+        self.elsewhere = 0
         self._counters = counters
         self._boards = boards
         self._others = others
@@ -166,10 +168,11 @@ class FrameForms:
             counters.other += 1
         elif (address := identifier >> 4 & 0xF) in self._boards:
             return half
-        elif address in self._others or (
+        elif address in self._others:
+            counters.other += 1
+            self.elsewhere += 1
+        elif message_class == MessageClass.ANALOG_STREAM and identifier & 0xF in MAIS_TYPES:
             # A frame of joints may have the form of one of skin.
-            message_class == MessageClass.ANALOG_STREAM and identifier & 0xF in MAIS_TYPES
-        ):
             counters.other += 1
         else:
             counters.unknown_board += 1

@@ -33,6 +33,9 @@ CALM_S = 10.0
 #: A frame that the interface does not take within this time is dropped.
 SEND_DEADLINE_S = 1.0
 _SEND_RETRY_S = 0.002
+#: With these codes a frame was not sent because there is no room for it yet. An error without a
+#: code shows no more than that; the last one is of Kvaser's library (canERR_TXBUFOFL).
+NO_ROOM = frozenset({None, errno.ENOBUFS, errno.EAGAIN, errno.ETIMEDOUT, -13})
 #: An unstable link writes at most one log line in the first of these times, which doubles up to the
 #: last.
 _QUIET_S = 1.0
@@ -121,10 +124,12 @@ class Port(ABC):
             moves them; the kernel's are not.
         on_sent: called with the identifier and the data of each frame that was sent: a bus does not
             return them to the port that sent them.
+        see_also: a command that shows more of the interface, for messages.
     """
 
     capacity: int
     stamps_late = False
+    see_also = ""
 
     def __init__(
         self, name: str, settings: Bus, bus: can.BusABC | None, clock: Clock = SYSTEM
@@ -186,8 +191,7 @@ class Port(ABC):
                         raise BusError(
                             f'bus "{self.name}": {self.channel}: the transmit queue stayed full '
                             f"for {SEND_DEADLINE_S:g} s; no other node acknowledges: check power, "
-                            f"wiring and termination (`ip -details -statistics link show "
-                            f"{self.channel}`)"
+                            f"wiring and termination{self.see_also.format(channel=self.channel)}"
                         )
                     self.counters.send_retries += 1
                     await self._clock.sleep(_SEND_RETRY_S)
@@ -207,9 +211,7 @@ class Port(ABC):
         try:
             await self._hand_over(self._bus, message)
         except Exception as error:
-            # An error without a code only means that the adapter could not send.
-            codes = {None, errno.ENOBUFS, errno.EAGAIN}
-            if isinstance(error, can.CanOperationError) and error.error_code in codes:
+            if isinstance(error, can.CanOperationError) and error.error_code in NO_ROOM:
                 return False
             raise BusError(f"{where}: {one_line(error)}") from None
         return True

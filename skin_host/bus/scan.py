@@ -1,6 +1,7 @@
 """`skin scan`: who is on a bus, for people; nothing is set up."""
 
 import asyncio
+from collections import Counter
 from dataclasses import dataclass
 
 from skin_host.bus.answers import Discovered, DiscoveredBootloader, parse_answer
@@ -31,7 +32,8 @@ async def scan(bus: Bus) -> list[FoundBoard]:
         BusError: the interface cannot be opened or does not take frames.
     """
     port = open_port("scan", bus, Receive())
-    found: dict[int, FoundBoard] = {}
+    #: More than one for an address, if boards of different types or firmware share it.
+    found: dict[int, list[FoundBoard]] = {}
     #: Of each board, which halves of which triangles came: a lone one may be no frame of skin.
     halves: dict[int, set[tuple[int, int]]] = {}
     try:
@@ -58,21 +60,23 @@ async def scan(bus: Bus) -> list[FoundBoard]:
                             f"{answer.firmware_major}.{answer.firmware_minor}."
                             f"{answer.firmware_build}"
                         )
-                        found[address] = FoundBoard(
-                            address, _type_name(answer.board_type), version, False, []
-                        )
                     elif isinstance(answer, DiscoveredBootloader):
-                        found[address] = FoundBoard(
-                            address, _type_name(answer.board_type), None, True, []
-                        )
+                        version = None
+                    else:
+                        continue
+                    kind = _type_name(answer.board_type)
+                    one = FoundBoard(address, kind, version, version is None, [])
+                    if one not in found.setdefault(address, []):
+                        found[address].append(one)
     finally:
         port.close()
     for address, seen in halves.items():
         triangles = sorted(triangle for triangle, half in seen if half and (triangle, 0) in seen)
         if triangles:
-            record = found.setdefault(address, FoundBoard(address, "unknown", None, False, []))
-            record.triangles = triangles
-    return [found[address] for address in sorted(found)]
+            streaming = FoundBoard(address, "unknown", None, False, [])
+            for record in found.setdefault(address, [streaming]):
+                record.triangles = triangles
+    return [record for address in sorted(found) for record in found[address]]
 
 
 def scan_table(found: list[FoundBoard], channel: str) -> str:
@@ -87,6 +91,12 @@ def scan_table(found: list[FoundBoard], channel: str) -> str:
         firmware = "bootloader" if one.in_bootloader else one.firmware or "-"
         streaming = format_triangles(one.triangles) or "-"
         lines.append(f"{one.address:>7}  {one.board_type:<8}  {firmware:<8}  {streaming}")
+    times = Counter(one.address for one in found)
+    lines += [
+        f"{n} boards answer at address {address}: give each one of its own"
+        for address, n in times.items()
+        if n > 1
+    ]
     return "\n".join(lines)
 
 

@@ -261,6 +261,7 @@ class SocketCanPort(Port):
     """
 
     capacity = CAPACITY
+    see_also = " (`ip -details -statistics link show {channel}`)"
 
     def __init__(
         self,
@@ -282,14 +283,16 @@ class SocketCanPort(Port):
         self._bus = bus
         self._socket: socket.socket = bus.socket  # type: ignore[attr-defined]
         self._receiver = BatchReceiver(self._socket, self._buffer_bytes)
-        self.counters.buffer_bytes = self._receiver.buffer_bytes
-        if self._receiver.buffer_bytes < self._buffer_bytes:
+        before, granted = self.counters.buffer_bytes, self._receiver.buffer_bytes
+        self.counters.buffer_bytes = granted
+        # A loose plug opens it again and again.
+        if granted < self._buffer_bytes and granted != before:
             log.warning(
                 'bus "%s": %s: receive buffer of %d bytes granted, %d wanted; '
                 "`sudo sysctl -w net.core.rmem_max=%d` allows it",
                 self.name,
                 self.channel,
-                self._receiver.buffer_bytes,
+                granted,
                 self._buffer_bytes,
                 self._buffer_bytes,
             )

@@ -42,11 +42,13 @@ def _touch_line(touch: Touch) -> str:
         x_mm, y_mm = 1e3 * touch.centroid_m[0], 1e3 * touch.centroid_m[1]
         where = f"({x_mm:6.1f},{y_mm:6.1f}) mm "
     peak = " " * 10 if touch.peak_kpa is None else f"{touch.peak_kpa:6.1f} kPa"
-    load = f"{peak} {touch.force_n:6.2f} N"
+    force = f"{'≥' if touch.force_is_bound else ''}{touch.force_n:.2f}"
+    load = f"{peak} {force:>6} N"
     if touch.event == "end":
         load = " " * len(load)
     felt = f"  taxels {taxels}" if taxels else ""
-    return _line(touch.part, touch.event, touch.id, f"{where} {load}{felt}")
+    why = "" if touch.reason in (None, "released") else f"  {touch.reason}: it may still last"
+    return _line(touch.part, touch.event, touch.id, f"{where} {load}{felt}{why}")
 
 
 def missed_line(event: Touch | Slip | Over, *, as_json: bool) -> str:

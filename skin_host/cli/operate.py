@@ -30,6 +30,7 @@ from skin_host.cli.common import (
     set_up_logging,
     warn,
     warn_of_virtual,
+    whole,
 )
 from skin_host.cli.options import add_rules
 from skin_host.daemon import service
@@ -91,6 +92,21 @@ def add_commands(commands: Commands) -> None:
     )
     scan.add_argument("--interface", type=filled, default="socketcan", help="python-can interface")
     scan.add_argument("--channel", type=filled, default="can0", help="its channel")
+    scan.add_argument(
+        "--bitrate",
+        type=whole(1000, 10_000_000),
+        default=1_000_000,
+        metavar="N",
+        help="bit/s, for interfaces that set it themselves",
+    )
+    scan.add_argument(
+        "--option",
+        type=_option,
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="a further argument for can.Bus, as of buses.NAME.options in a configuration",
+    )
     scan.add_argument("--json", action="store_true", help="one JSON document")
     scan.set_defaults(run=_scan)
 
@@ -157,6 +173,22 @@ def _share(text: str) -> tuple[int, int]:
     if not re.fullmatch("[1-9][0-9]{0,8}/[1-9][0-9]{0,8}", text) or int(number) > int(n):
         raise argparse.ArgumentTypeError(f"seen {text}, wanted NUMBER/OF such as 1/2")
     return int(number), int(n)
+
+
+def _option(text: str) -> tuple[str, str | int | float | bool]:
+    """An option of a bus, for argparse: its value is read as in a configuration, but text has no
+    quotes.
+    """
+    key, equals, value = text.partition("=")
+    if not (key and equals):
+        raise argparse.ArgumentTypeError(f"seen {text}, wanted KEY=VALUE such as host=10.0.0.5")
+    if value in ("true", "false"):
+        return key, value == "true"
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            number = kind(value)
+            return key, number if math.isfinite(number) else value
+    return key, value
 
 
 def reload_on_hangup(daemon: "Daemon") -> None:
@@ -296,9 +328,19 @@ def _scan(arguments: argparse.Namespace) -> int:
     import asyncio
 
     from skin_host.bus.scan import scan, scan_table
+    from skin_host.config.explain import explain
     from skin_host.config.settings import Bus
 
-    bus = Bus(interface=arguments.interface, channel=arguments.channel)
+    document = {
+        "interface": arguments.interface,
+        "channel": arguments.channel,
+        "bitrate": arguments.bitrate,
+        "options": dict(arguments.option),
+    }
+    try:
+        bus = msgspec.convert(document, Bus)
+    except msgspec.ValidationError as error:
+        raise RequestError(visible(explain(document, error, Bus, {}))) from None
     found = asyncio.run(scan(bus))
     if arguments.json:
         print_json({"boards": [asdict(one) for one in found]})

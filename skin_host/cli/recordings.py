@@ -237,6 +237,7 @@ def _record(arguments: argparse.Namespace) -> int:
             told = run(partial(_capture, arguments, recorder, None), arguments.seconds)
             if not recorder.messages:
                 _require_frames(arguments, 0)
+                raise SkinError(f"{file}: nothing is recorded; it ended before any robot answered")
         told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
     else:
         can_suffix(file)
@@ -284,11 +285,15 @@ async def _capture(
     import asyncio
 
     from skin_host.recording.capture import capture_broker, capture_buses
+    from skin_host.tasks import until
 
     told: dict[str, Any] = {}
 
     async def from_broker() -> None:
-        broker, base, robot = await _robot(arguments.broker or LOCAL, arguments.robot)
+        found = await until(stop, _robot(arguments.broker or LOCAL, arguments.robot))
+        if found is None:
+            return
+        broker, base, robot = found
         told["gaps"] = await capture_broker(recorder, broker, base, robot, stop)
         told["messages_lost"] = recorder.discarded
 

@@ -102,24 +102,21 @@ class Intake:
             self._note_unreadable(message.topic.value, error)
             if not isinstance(error, MessageError):  # it is we who cannot read it
                 for stream in self._streams:
-                    if kind in stream.kinds and stream.part in (None, name):
+                    if stream.takes(kind, name):
                         stream.refuse(kind, error)
         return True
 
     def begin(self, stream: Stream[Any]) -> None:
         """Pass what is known already on to a stream that was opened."""
-        if "health" in stream.kinds:
-            for name, health in self._latest.items():
-                if stream.part in (None, name):
-                    stream.put(health)
-        if "contact" in stream.kinds:
-            for contact in self.presence.reported():
-                if stream.part in (None, contact.part):
-                    stream.put(contact)
-        if "info" in stream.kinds:
-            for described in self.nodes.described():
-                if stream.part in (None, described.part):
-                    stream.put(described)
+        known: dict[str, Iterable[Health | Contact | Described]] = {
+            "health": self._latest.values(),
+            "contact": self.presence.reported(),
+            "info": self.nodes.described(),
+        }
+        for kind, items in known.items():
+            for item in items:
+                if stream.takes(kind, item.part):
+                    stream.put(item)
 
     def forget(self, kind: str, kinds_of: Callable[[str], Container[str]]) -> None:
         """Forget states of parts, or touches, that are not followed any more.
@@ -279,7 +276,7 @@ class Intake:
         run: int | None = None,
     ) -> None:
         for stream in self._streams:
-            if kind in stream.kinds and stream.part in (None, item.part):
+            if stream.takes(kind, item.part):
                 stream.put(item, run)
 
     def _report_contacts(self) -> None:

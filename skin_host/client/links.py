@@ -28,6 +28,9 @@ from skin_host.tasks import leave_if_cancelled
 MAX_INCOMING = 10_000
 #: The broker keeps touch events for this long while we are disconnected (MQTT 5).
 SESSION_S = 60
+#: Of these it keeps nothing (QoS 0): they would take the room of events, and old states would look
+#: new. The present ones come with each subscription.
+NOT_KEPT = ("/frame", "/contact", "/health")
 
 #: Retained messages come within this time of a subscription, or of the first of them.
 RETAINED_S = 0.5
@@ -155,7 +158,7 @@ class BrokerLink:
             for topic in wanted:
                 if topic in self._subscribed:
                     continue
-                qos = 0 if topic.endswith("/frame") else 1
+                qos = 0 if topic.endswith(NOT_KEPT) else 1
                 if not await connection.listen_to(topic, qos, as_published=False):
                     self.refused.add(topic)
                     _log.info("broker %s: refuses us the topic %s", self.broker, topic)

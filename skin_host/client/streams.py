@@ -76,21 +76,28 @@ class SentTwice:
     again, and without MQTT 5 each of several brokers sends it.
 
     They have the same number and time. One of an equal number at another time is of another run.
+
+    Args:
+        span: so many items of a part and kind are known.
     """
 
-    def __init__(self) -> None:
-        self._latest: dict[tuple[type, str], deque[tuple[int, int]]] = {}
+    def __init__(self, span: int = DUPLICATE_SPAN) -> None:
+        self._span = span
+        #: Numbers and times in their order, as a set.
+        self._latest: dict[tuple[type, str], dict[tuple[int, int], None]] = {}
 
     def has(self, item: _Numbered) -> bool:
         """Return whether an item is among the last ones of its part and kind, and note it."""
         number = item.seq if isinstance(item, Frame) else item.count
         if not number and not isinstance(item, Frame):
             return False  # a publisher that does not count cannot be checked
-        latest = self._latest.setdefault((type(item), item.part), deque(maxlen=DUPLICATE_SPAN))
+        latest = self._latest.setdefault((type(item), item.part), {})
         which = number, item.t_ns
         if which in latest:
             return True
-        latest.append(which)
+        latest[which] = None
+        if len(latest) > self._span:
+            del latest[next(iter(latest))]
         return False
 
 
@@ -128,6 +135,10 @@ class Stream(AsyncIterator[T], Generic[T]):
         #: What the reader was too slow for, until the next item that is read.
         self._lost: dict[tuple[type, str], int] = {}
         self._repeats = SentTwice()
+
+    def takes(self, kind: str, part: str) -> bool:
+        """Return whether a kind of item of a part belongs to it."""
+        return kind in self.kinds and self.part in (None, part)
 
     def put(self, item: T, run: int | None = None) -> None:
         """Add a received item, unless it came before.

@@ -39,6 +39,10 @@ FRAME_BITS = (111, 135)
 FRAMES_PER_TRIANGLE = 2
 #: The same for the two frames of six bytes that make one sample of force and torque.
 WRENCH_BITS = (2 * 95, 2 * 115)
+#: The boards' firmware has no other bit rate.
+BITRATE = 1_000_000
+#: Interfaces that have none.
+WITHOUT_BITRATE = ("virtual", "udp_multicast")
 #: A bus with a higher load has no room for commands and retransmissions.
 WARN_LOAD = 0.8
 #: Twelve stages at decimation 256 take the chip this long (AD7147; MTB3's timer constants).
@@ -85,7 +89,7 @@ def describe(settings: Settings, layout: Layout) -> Record:
             "area_cm2": round(sum(part["area_cm2"] for part in parts), 1),
         },
         "warnings": [
-            *_bus_warnings(buses, {tip.bus for tip in settings.fingertips.values()}),
+            *_bus_warnings(buses, settings),
             *_interface_warnings(buses),
             *_board_warnings(layout),
             *_position_warnings(settings, layout),
@@ -144,7 +148,12 @@ def _part(number: int, layout: Layout) -> Record:
     }
 
 
-def _bus_warnings(buses: list[Record], used: set[str]) -> list[str]:
+def _bus_warnings(buses: list[Record], settings: Settings) -> list[str]:
+    used = {tip.bus for tip in settings.fingertips.values()}
+    # Two servers of buses may each have a can0.
+    where = {
+        name: (bus.interface, bus.channel, bus.options) for name, bus in settings.buses.items()
+    }
     return (
         [
             f"buses.{bus['name']}: skin frames take {_load(bus['load'])} of the bus; "
@@ -152,6 +161,12 @@ def _bus_warnings(buses: list[Record], used: set[str]) -> list[str]:
             "another bus"
             for bus in buses
             if bus["load"][1] > WARN_LOAD
+        ]
+        + [
+            f"buses.{name}.bitrate: {bus.bitrate}; MTB boards send and receive at {BITRATE} bit/s "
+            "alone"
+            for name, bus in settings.buses.items()
+            if bus.bitrate != BITRATE and bus.interface not in WITHOUT_BITRATE
         ]
         + [
             f"buses.{bus['name']}: no board is on this bus; it will be opened for nothing"
@@ -162,7 +177,7 @@ def _bus_warnings(buses: list[Record], used: set[str]) -> list[str]:
             f"buses.{later['name']}.channel: {later['channel']} is that of buses.{bus['name']} "
             "too; each receives the frames of both"
             for bus, later in combinations(buses, 2)
-            if (bus["interface"], bus["channel"]) == (later["interface"], later["channel"])
+            if where[bus["name"]] == where[later["name"]]
         ]
     )
 

@@ -53,7 +53,7 @@ _PASSING = {
     "taxel_noisy",
 }
 #: What a bus gains in a second through faults.
-_LOSSES = ("wrong", "halves", "dropped", "error_frames")
+_LOSSES = ("wrong", "halves", "dropped", "overflows", "error_frames")
 
 
 class HealthWatch:

@@ -9,8 +9,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.bus.assembler import Assembler
 from skin_host.bus.ledger import BoardLedger
-from skin_host.bus.wire import TRIANGLES, StatusError
+from skin_host.bus.wire import TRIANGLES, StatusError, skin_id
 from skin_host.health.diagnosis import JITTER_SHARE
 from skin_host.health.record import (
     BoardHealth,
@@ -60,7 +61,16 @@ ABSENT_SWEEPS = 3
 CONSTANT_NS = 1_000_000_000
 #: A baseline counts as drifting when it has moved by more than this share of its limit.
 DRIFTING_SHARE = 0.25
-_COUNTS = ("wrong", "halves", "missed", "unknown", "spikes", "dropped", "error_frames")
+_COUNTS = (
+    "wrong",
+    "halves",
+    "missed",
+    "unknown",
+    "spikes",
+    "dropped",
+    "overflows",
+    "error_frames",
+)
 
 
 class Describer:
@@ -558,15 +568,31 @@ class Describer:
         manager = boards.get(name)
         if manager is not None:
             record["strangers"] = dict(manager.strangers)
-            stranger_id = self._engine.assemblers[name].stranger_id
-            if stranger_id is not None:
-                record["stranger"] = f"0x{stranger_id:x}"
+            gained = self._watch.buses[name].gained
+            if (stranger := _stranger(self._engine.assemblers[name], gained)) is not None:
+                record["stranger"] = stranger
         watch = self._watch.buses[name]
         if watch.gained and now_ns is not None:
             record["last_second"] = _last_second(watch.gained, bus.bitrate)
             record["spiked_pads"] = watch.spiked_pads
             record["silent"] = watch.silent
+            record["lost_here"] = watch.lost_here(now_ns)
         return record
+
+
+def _stranger(assembler: Assembler, gained: dict[str, float]) -> str | None:
+    """Return what the unconfigured node sends that sends most, as far as that is known."""
+    if gained and gained["unconfigured"] > _others(gained):
+        ((address, _),) = assembler.unconfigured.most_common(1)
+        return f"0x{skin_id(address, 0):x}-0x{skin_id(address, TRIANGLES - 1):x}"
+    return None if assembler.stranger_id is None else f"0x{assembler.stranger_id:x}"
+
+
+def _others(gained: dict[str, float]) -> float:
+    """Return how many frames a bus has gained of what no node of the robot is configured for, but
+    for those of boards of skin.
+    """
+    return gained["other"] - gained["elsewhere"] - gained["error_frames"]
 
 
 def enough_rest(rests: Mask, usable: Mask) -> bool:
@@ -664,8 +690,9 @@ def _last_second(gained: dict[str, float], bitrate: int) -> LastSecond:
     counts = {key: int(gained[key]) for key in _COUNTS}
     loads = {
         "frames_hz": round(gained["frames"] / seconds),
-        "load": round(gained["frames"] * load, 3),
-        "other_load": round(gained["other"] * load, 3),
+        # Reports of the controller are no frames of the bus.
+        "load": round((gained["frames"] - gained["error_frames"]) * load, 3),
+        "other_load": round((_others(gained) + gained["unconfigured"]) * load, 3),
     }
     return cast(LastSecond, loads | counts)
 

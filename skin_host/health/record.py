@@ -11,9 +11,10 @@ from typing import Any, NotRequired, TypedDict
 class LastSecond(TypedDict):
     """What a bus has gained in about the last second.
 
-    `load` and `other_load` are shares of the bus: of all frames, and of the frames of other
-    devices. The others are counts; `wrong` are frames with a wrong header, too few bytes, or
-    unreadable; `spikes` single bytes that were off for one sweep.
+    `load` and `other_load` are shares of the bus: of all frames, and of the frames of devices that
+    are not configured. The others are counts; `wrong` are frames with a wrong header, too few
+    bytes, or unreadable; `spikes` single bytes that were off for one sweep; `overflows` how often
+    the controller or its driver lost frames.
     """
 
     frames_hz: int
@@ -25,15 +26,17 @@ class LastSecond(TypedDict):
     unknown: int
     spikes: int
     dropped: int
+    overflows: int
     error_frames: int
 
 
 class BusHealth(TypedDict):
     """One bus: the counters of `AssemblerCounters`, and those of its port.
 
-    `port` are `PortCounters`. Unconfigured boards are given by type and address, and by the most
-    frequent identifier among the frames of unconfigured nodes. `spiked_pads` are those of which a
+    `port` are `PortCounters`. Unconfigured boards are given by type and address, and by the
+    identifiers of the unconfigured node that sends most. `spiked_pads` are those of which a
     single byte was off within the last ten seconds. `unopened` is why the bus cannot be opened.
+    `lost_here`: within the last two seconds this computer or its controller lost frames.
     """
 
     name: str
@@ -60,6 +63,7 @@ class BusHealth(TypedDict):
     last_second: NotRequired[LastSecond]
     spiked_pads: NotRequired[int]
     silent: NotRequired[bool]
+    lost_here: NotRequired[bool]
 
 
 class BoardHealth(TypedDict):

@@ -30,6 +30,8 @@ SPIKED_NS = 10_000_000_000
 ALONE_NS = 200_000_000
 #: Foam that was pressed pushes for so long that a pad reads too much, as drift's `SETTLE_S`.
 FOAM_NS = 5_000_000_000
+#: What is watched of the counters of a port.
+_OF_PORT = ("damaged", "dropped", "controller_overflows", "error_frames")
 
 
 @dataclass(slots=True)
@@ -167,6 +169,7 @@ class BusWatch:
     Attributes:
         gained: in about the last second, see `Window`; empty before the first call of `note`.
         spiked_pads: how many of its pads were off for one sweep within `SPIKED_NS`.
+        lost_ns: when this computer, or its controller, was last seen to have lost frames.
         received_ns: when a frame was last received, on the ledger's clock.
     """
 
@@ -174,6 +177,7 @@ class BusWatch:
     received_ns: int = 0
     silent: bool = False
     spiked_pads: int = 0
+    lost_ns: int | None = None
     gained: dict[str, float] = field(default_factory=dict)
     _window: Window = field(default_factory=lambda: Window(RECENT_NS))
 
@@ -196,6 +200,12 @@ class BusWatch:
             self.received_ns = ledger_ns
         self.silent = ledger_ns - self.received_ns > silent_after_ns and not awaited
         self.gained = self._window.note(now_ns, totals)
+        if self.gained.get("dropped") or self.gained.get("overflows"):
+            self.lost_ns = now_ns
+
+    def lost_here(self, now_ns: int) -> bool:
+        """Whether what is missing now, or until a moment ago, was lost in this computer."""
+        return self.lost_ns is not None and abs(now_ns - self.lost_ns) < RECENT_NS
 
 
 class Watch:
@@ -278,19 +288,23 @@ class Watch:
         return tuple(counts.tobytes() for counts in events)
 
     def _totals(self, bus: str, port: "Port | None") -> dict[str, int]:
-        counters = self._engine.assemblers[bus].counters
-        damaged = 0 if port is None else port.counters.damaged
+        assembler = self._engine.assemblers[bus]
+        counters = assembler.counters
+        of_port = {one: 0 if port is None else getattr(port.counters, one) for one in _OF_PORT}
         return {
             "frames": counters.frames,
             "sweeps": counters.sweeps,
             "other": counters.other,
-            "wrong": counters.wrong_header + counters.short + damaged,
+            "elsewhere": assembler.elsewhere,
+            "wrong": counters.wrong_header + counters.short + of_port["damaged"],
             "halves": counters.halves,
             "missed": counters.missed,
             "unknown": counters.unknown_board + counters.unknown_triangle,
+            "unconfigured": counters.unknown_board,
             "spikes": self._spikes_of(bus),
-            "dropped": 0 if port is None else port.counters.dropped,
-            "error_frames": 0 if port is None else port.counters.error_frames,
+            "dropped": of_port["dropped"],
+            "overflows": of_port["controller_overflows"],
+            "error_frames": of_port["error_frames"],
         }
 
     def _spikes_of(self, bus: str) -> int:

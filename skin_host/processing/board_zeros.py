@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from skin_host.bus.assembler import Sweep
 from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TRIANGLES, StatusError
-from skin_host.layout import Layout
+from skin_host.layout import Layout, PadKind
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.drift import SETTLE_S
 from skin_host.processing.frame import PressureFrame
@@ -540,6 +540,7 @@ class BoardZeros:
             touched,
             STILL_SHARE * np.maximum(read_units, felt_units),
             before,
+            (taxels >= 0) & (self._layout.pad_kind[taxels] == PadKind.PRESSURE),
         )
 
     def _judge_again(self, board: int) -> None:
@@ -579,6 +580,10 @@ class BoardZeros:
         if zeroed is None and not silent_zero.clear:
             self._intake.veto[row] = np.ones((TRIANGLES, PADS), np.bool_)
             return
+        drifted_units = silent_zero.drifted_units() if silent_zero.decided else None
+        if drifted_units is not None and self._pipeline is not None:
+            taxels = self._of(sweep.board).ravel()
+            self._pipeline.catch_up(taxels[taxels >= 0], drifted_units[taxels >= 0])
         rezero = self.rezeros.get(sweep.board)
         if rezero is None:
             self._intake.veto.pop(row, None)

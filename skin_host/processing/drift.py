@@ -288,6 +288,13 @@ class BaselineTracker:
         """Nothing was received for this time: a touch after it is a new touch."""
         self._touches.fade(math.exp(-gap_s / SETTLE_S))
 
+    def catch_up(self, units: Array) -> None:
+        """Taxels have drifted by this [n] while they were not received."""
+        self._note_drift(units)
+        np.clip(self.baseline + units * self._usable, self._low, self._high, out=self.baseline)
+        if self._thermal is not None:
+            self._thermal.miss(units != 0.0)
+
     def forget(self, taxels: Mask) -> None:
         """Start again with some taxels, bool[n]: their baselines are new, and drift counts from
         them.

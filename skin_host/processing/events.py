@@ -95,6 +95,13 @@ class Touch(
     load: Load | None = None
     missed: int = 0
 
+    @property
+    def force_is_bound(self) -> bool:
+        """Whether `force_n` is only known not to be less."""
+        if self.load is not None:
+            return self.load.verdict == "saturated"
+        return self.partial or self.beyond
+
     def ended(self, seq: int, t_ns: int, reason: Reason = "released") -> "Touch":
         """The contact's end: where it was last; what is known of its pressures is 0."""
         nothing_kpa = None if self.area_mm2 is None else 0.0

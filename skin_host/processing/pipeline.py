@@ -156,6 +156,18 @@ class Pipeline:
         for part in self._parts:
             part.begin_anew(anew)
 
+    def catch_up(self, taxels: NDArray[np.int32], units: NDArray[np.float64]) -> None:
+        """Continue from baselines that have drifted while their taxels were not received.
+
+        Args:
+            taxels: int32[k], which ones.
+            units: float64[k], by how much.
+        """
+        drifted_units = np.zeros(len(self.baseline))
+        drifted_units[taxels] = units
+        for part in self._parts:
+            part.catch_up(drifted_units)
+
     @property
     def levels(self) -> Levels:
         """Where the taxels [n] begin and end to be touched, in units."""
@@ -405,6 +417,16 @@ class _PartPipeline:
             self._forget(anew)
             self._renew_limits()
             self._begin_anew(anew)
+
+    def catch_up(self, units: NDArray[np.float64]) -> None:
+        """See `Pipeline.catch_up`; the drift float64[n] of all taxels of the skin."""
+        drifted = units[self._mine] != 0.0
+        if any_of(drifted):
+            self.drift.catch_up(units[self._mine])
+            # What these sent before is no reading above the new baselines.
+            self._windows.forget(drifted)
+            self._renew_limits()
+            self._begin_anew(drifted)
 
     def _forget(self, taxels: Mask) -> None:
         """Take taxels [m] for relaxed: what the foam keeps of a press is in their new zero."""

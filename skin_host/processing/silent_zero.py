@@ -23,6 +23,12 @@ either shows it, and goes on being compared. What still presses after a silence 
 would have ended was there all the time, whatever the others show: beside it pads are pressed too
 lightly for a touch, and had moved as those of a new zero do.
 
+In a silence of minutes the skin becomes warmer or colder. Where most pads have moved then, and rose
+by no more than temperature pads show, the baselines move with them before any pad is valid again:
+otherwise all would be touched at once, and would stay it, because a touch hides drift. Without
+temperature pads, what rose no faster than drift does is taken for it, as a load that comes slowly
+is (`drift`). So such a board waits for all ten sweeps.
+
 Where most pads read more than a new zero and any drift leave, neither explains the readings:
 something presses on them. Then which of two improbable ones is less so shows nothing.
 """
@@ -33,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.processing.conversions import CONVERSION_S
-from skin_host.processing.drift import SLOW_UNITS_PER_S
+from skin_host.processing.drift import ALIKE_SHARE, REFERENCES, SLOW_UNITS_PER_S
 from skin_host.processing.masks import Mask
 from skin_host.processing.touch import LOST_S
 
@@ -63,6 +69,13 @@ COMMON_UNITS = 1.0
 MOST_COMMON_UNITS = 10.0
 #: By this share of what a long silence adds, pads may drift apart: they differ in their foam.
 APART_SHARE = 0.2
+#: Without temperature pads a drift is followed up to so many units, as ten degrees make.
+MOST_DRIFTED_UNITS = 5.0
+#: Pads drift alike when they differ from what most do by no more than this share of it, `OWN_UNITS`
+#: and so many standard deviations. One in ten emulated ones hardly drifts, a few do twice as much.
+UNLIKE_SHARE = 0.6
+ALIKE_SIGMAS = 2.0
+MOST_SHARE = 2.0
 #: Common drifts are tried up to so many standard deviations, in steps of so many units.
 COMMON_SIGMAS = 3.0
 STEP_UNITS = 0.25
@@ -90,6 +103,7 @@ class SilentZero:
         still_units: float64[n], a taxel that reads more than this is still touched.
         before: the same after its last silence, if what came since then has not decided: its
             baseline is still from before that.
+        pressure: bool[n], pads that measure pressure, all by default.
 
     Attributes:
         silent_s, touched: as given.
@@ -112,11 +126,13 @@ class SilentZero:
         touched: Mask | None = None,
         still_units: Floats | None = None,
         before: "SilentZero | None" = None,
+        pressure: Mask | None = None,
     ) -> None:
         self._baseline = baseline
         self._noise = noise
         self._spread = spread
         self._known = known
+        self._pressure: Mask = np.ones_like(known) if pressure is None else pressure
         self.touched: Mask = np.zeros_like(known) if touched is None else touched
         if before is not None:
             still_units = before.still_units
@@ -177,9 +193,52 @@ class SilentZero:
             if self._first is not None:
                 self._add(*self._first)
             return self.was_zeroed
-        if not self.clear and not self.at_start and self._compared >= self._fewest:
+        if not self.clear and not self._drifts and self._compared >= self._fewest:
             self.clear = self._is_clear()
         return None
+
+    @property
+    def _drifts(self) -> bool:
+        """Whether pads may have drifted so much together that it counts where they rest now."""
+        return SLOW_UNITS_PER_S * self.unseen_s > OWN_UNITS
+
+    def drifted_units(self) -> Floats | None:
+        """Return by how much the untouched readings [n] have drifted in a long silence without a
+        zero, once that is decided; None if they have not, or if it may be a load.
+
+        Each pad that reads no more than drift may leave takes its own reading for it.
+        """
+        received = self._count >= FEWEST
+        seen = self._known & self._pressure & received
+        if not self._drifts or self.at_start or np.count_nonzero(seen) < REFERENCES:
+            return None
+        mean, variance = self._mean_of(seen)
+        moved = mean - self._baseline[seen]
+        common = float(np.median(moved))
+        apart = OWN_UNITS + UNLIKE_SHARE * abs(common) + ALIKE_SIGMAS * np.sqrt(variance)
+        alike = np.abs(moved - common) < apart
+        of_all = np.count_nonzero(seen | (self.touched & self._pressure & received))
+        if np.count_nonzero(alike) < ALIKE_SHARE * of_all or common > self._most_drifted(received):
+            return None
+        drifted = np.where(self._pressure, common, 0.0)
+        shared = max(common, 0.0)
+        drifted[seen] = np.where(moved > OWN_UNITS + MOST_SHARE * shared, shared, moved)
+        return drifted
+
+    def _most_drifted(self, received: Mask) -> float:
+        """Return how much untouched pads may have risen together, in units.
+
+        Temperature pads show what becomes warmer, and nothing of what presses.
+
+        Args:
+            received: bool[n], pads that came often enough.
+        """
+        warm = self._known & ~self._pressure & received
+        if np.count_nonzero(warm) < REFERENCES:
+            return min(SLOW_UNITS_PER_S * self.unseen_s + OWN_UNITS, MOST_DRIFTED_UNITS)
+        mean, _ = self._mean_of(warm)
+        risen = float(np.mean(mean - self._baseline[warm]))
+        return min(OWN_UNITS + max(risen, 0.0), MOST_COMMON_UNITS)
 
     def _add(self, units: Floats, present: Mask) -> None:
         self._sum += units

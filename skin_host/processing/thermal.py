@@ -38,6 +38,10 @@ class ThermalReference:
         self._temperature[anew] = np.nan
         self._sums[:, anew] = 0.0
 
+    def miss(self, taxels: Mask) -> None:
+        """The temperature of some taxels, bool[n], has changed, and so have their baselines."""
+        self._temperature[taxels] = np.nan
+
     def step(self, units: Array, baseline: Array, free: Mask, missing: Mask, dt_s: float) -> Array:
         """Return the predicted change [n] of the baselines; learn from the untouched taxels.
 

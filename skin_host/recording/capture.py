@@ -359,7 +359,12 @@ async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None
                     is_out = False
                     async for message in connection.messages:
                         if isinstance(message.payload, bytes):
-                            recorder.say(message.topic.value, time.time_ns(), message.payload)
+                            recorder.say(
+                                message.topic.value,
+                                time.time_ns(),
+                                message.payload,
+                                stored=message.retain,
+                            )
                 finally:
                     recorder.discarded += connection.discarded
         except* SkinError as group:

@@ -3,7 +3,8 @@
 Foxglove and every MCAP reader open them. Messages keep their topic and, in JSON, their bytes;
 frames in CBOR are stored as equivalent JSON. CAN frames are in channels `can/<channel>`, with some
 milliseconds per message. A recording is written under a temporary name and renamed when it is
-closed; an interrupted one can be repaired with `mcap recover`.
+closed; an interrupted one can be repaired with `mcap recover`. What the broker had stored when it
+was asked, which may be from any time, is in channels of their own, with `stored` in their metadata.
 """
 
 import contextlib
@@ -23,8 +24,14 @@ from skin_host.files import Draft, refuse_removed, writing
 from skin_host.fingertip.events import Over, Slip
 from skin_host.health.record import Record
 from skin_host.mqtt.frames import FRAME_SCHEMA, JsonFrame, decode_frame, encode_frame
-from skin_host.mqtt.info import INFO_SCHEMA, NodeInfo
-from skin_host.mqtt.messages import EVENT_DECODERS, HEALTH_SCHEMA, Frame, decode_contact
+from skin_host.mqtt.info import INFO_SCHEMA, NodeInfo, decode_info
+from skin_host.mqtt.messages import (
+    EVENT_DECODERS,
+    HEALTH_SCHEMA,
+    Frame,
+    decode_contact,
+    decode_health,
+)
 from skin_host.mqtt.topics import PartTopic, Topics, wrong_topic
 from skin_host.processing.events import Touch
 from skin_host.processing.frame import PressureFrame
@@ -35,6 +42,8 @@ if TYPE_CHECKING:
 
 CAN = "can/"
 MARKS = "marks"
+#: In the metadata of a channel: what is in it the broker had before it was asked.
+STORED = "stored"
 #: Nobody has as many parts; the format numbers topics in 16 bits.
 MAX_TOPICS = 10_000
 #: Nothing that is worth recording is longer.
@@ -50,11 +59,14 @@ _log = logging.getLogger(__name__)
 
 
 class RecordedMessage(NamedTuple):
-    """One message of a recording: topic, time of reception, and its bytes."""
+    """One message of a recording: topic, time of reception, its bytes, and whether the broker had
+    stored it, as far as the recording shows that.
+    """
 
     topic: str
     t_ns: int
     payload: bytes
+    stored: bool = False
 
 
 class _Text(Struct):
@@ -118,7 +130,8 @@ class Recorder:
         self._writer = mcap_writer.Writer(self._file)
         self._writer.start(profile="", library="skin-host")
         self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
+        #: By topic, and whether for what the broker had stored.
+        self._channels: dict[tuple[str, bool], int] = {}
         self._numbers: dict[str, int] = {}
 
     def __enter__(self) -> Self:
@@ -132,16 +145,23 @@ class Recorder:
         else:
             self.close()
 
-    def say(self, topic: str, t_ns: int, payload: bytes) -> None:
+    def say(self, topic: str, t_ns: int, payload: bytes, *, stored: bool = False) -> None:
         """Record a message received at `t_ns`; an unreadable one is counted.
+
+        Args:
+            topic: of the message.
+            t_ns: when it was received.
+            payload: of the message. Of a health or an info that was deleted there is none, and
+                nothing to record.
+            stored: the broker had it before it was asked.
 
         Raises:
             SkinError: the disk is full or gone.
         """
         kind = _kind(topic)
-        if kind is None:
+        if kind is None or (kind in ("health", "info") and not payload):
             return
-        is_more = topic not in self._channels and len(self._channels) >= MAX_TOPICS
+        is_more = (topic, stored) not in self._channels and len(self._channels) >= MAX_TOPICS
         if is_more or len(payload) > MAX_PAYLOAD:
             self.unreadable += 1
             return
@@ -150,7 +170,7 @@ class Recorder:
         except (SkinError, msgspec.DecodeError, UnicodeDecodeError):
             self.unreadable += 1
             return
-        self._add(topic, kind, t_ns, sent_ns, data)
+        self._add(topic, kind, t_ns, sent_ns, data, stored=stored)
 
     def can(self, channel: str, batch: FrameBatch) -> None:
         """Record CAN frames of a channel.
@@ -202,20 +222,26 @@ class Recorder:
                 self._writer.finish()
             self._draft.finish()
 
-    def _add(self, topic: str, kind: str, t_ns: int, sent_ns: int, data: bytes) -> None:
+    def _add(
+        self, topic: str, kind: str, t_ns: int, sent_ns: int, data: bytes, *, stored: bool = False
+    ) -> None:
+        which = topic, stored
         with writing(self._path):
             refuse_removed(self._draft.path)
-            if topic not in self._channels:
+            if which not in self._channels:
                 if kind not in self._schemas:
                     name, content = _TYPES[kind]
                     encoded = msgspec.json.encode(_schema(name, content))
                     self._schemas[kind] = self._writer.register_schema(name, "jsonschema", encoded)
-                self._channels[topic] = self._writer.register_channel(
-                    topic=topic, message_encoding="json", schema_id=self._schemas[kind]
+                self._channels[which] = self._writer.register_channel(
+                    topic=topic,
+                    message_encoding="json",
+                    schema_id=self._schemas[kind],
+                    metadata={STORED: "true"} if stored else {},
                 )
             number = self._numbers[topic] = self._numbers.get(topic, 0) + 1
             self._writer.add_message(
-                channel_id=self._channels[topic],
+                channel_id=self._channels[which],
                 log_time=max(0, t_ns),
                 publish_time=max(0, sent_ns),
                 sequence=number % 2**32,
@@ -230,12 +256,14 @@ def read_messages_of(path: Path) -> Iterator[RecordedMessage]:
     Raises:
         LogError: it cannot be read, or breaks off.
     """
-    for topic, t_ns, data in _messages(path):
+    for channel, t_ns, data in _messages(path):
+        topic, stored = channel.topic, channel.metadata.get(STORED) == "true"
         kind = _kind(topic)
         if kind in ("contact", "status"):
-            yield RecordedMessage(topic, t_ns, _decode(path, topic, data, _Text).text.encode())
+            payload = _decode(path, topic, data, _Text).text.encode()
+            yield RecordedMessage(topic, t_ns, payload, stored)
         elif kind is not None:
-            yield RecordedMessage(topic, t_ns, data)
+            yield RecordedMessage(topic, t_ns, data, stored)
 
 
 def read_can(path: Path) -> Iterator[tuple[str, FrameBatch]]:
@@ -245,7 +273,8 @@ def read_can(path: Path) -> Iterator[tuple[str, FrameBatch]]:
         LogError: it cannot be read, breaks off, or holds no CAN frames.
     """
     found = False
-    for topic, _, data in _messages(path):
+    for channel, _, data in _messages(path):
+        topic = channel.topic
         if not topic.startswith(CAN):
             continue
         found = True
@@ -319,11 +348,11 @@ def read_records(path: Path) -> "Iterator[tuple[Schema | None, Channel, Message]
             ) from None
 
 
-def _messages(path: Path) -> Iterator[tuple[str, int, bytes]]:
-    """(topic, time, data) of every message in JSON, which are all of ours."""
+def _messages(path: Path) -> "Iterator[tuple[Channel, int, bytes]]":
+    """(channel, time, data) of every message in JSON, which are all of ours."""
     for _, channel, message in read_records(path):
         if channel.message_encoding == "json":
-            yield channel.topic, message.log_time, message.data
+            yield channel, message.log_time, message.data
 
 
 def _check_chunk(path: Path, record: "Chunk") -> None:
@@ -386,7 +415,7 @@ def _checked(topic: str, kind: str, payload: bytes, t_ns: int) -> tuple[bytes, i
         if kind == "contact" and payload:
             decode_contact(payload)
         return msgspec.json.encode(_Text(payload.decode())), t_ns
-    from_json(payload, dict[str, Any])
+    (decode_health if kind == "health" else decode_info)(payload)
     return payload, t_ns
 
 

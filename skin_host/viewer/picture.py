@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from skin_host.client import Contact, Frame, Health, NodeInfo, Touch
+from skin_host.client import Contact, Frame, Health, NodeInfo, PartInfo, Touch
 
 FRAME = 1
 HAS_RAW = 1
@@ -182,7 +182,7 @@ class Picture:
         self.parts = {}
         parts: list[dict[str, Any]] = []
         described = [
-            (node, name, len(part.pads), msgspec.to_builtins(part))
+            (node, name, len(part.pads), _description(part, info.frame_hz))
             for node, info in nodes.items()
             for name, part in info.parts.items()
             if self._holders.get(name) == node
@@ -237,6 +237,13 @@ class Picture:
         raw = b"" if frame.raw is None else frame.raw.tobytes()
         pressure = frame.pressure_kpa.astype("<f4").tobytes()
         return head + pressure + bits.astype(np.uint8).tobytes() + raw
+
+
+def _description(part: PartInfo, frame_hz: float) -> dict[str, Any]:
+    """Describe a part for pages; its period is that of its frames, which may be thinned."""
+    thinned_ms = 1000.0 / frame_hz if frame_hz > 0 else 0.0
+    described: dict[str, Any] = msgspec.to_builtins(part)
+    return described | {"period_ms": max(part.period_ms, thinned_ms)}
 
 
 def _contacts_text(name: str, part: PartView, contact: Contact | None) -> str:

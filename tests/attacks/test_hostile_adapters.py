@@ -433,3 +433,69 @@ def test_stamps_of_a_clock_that_is_ahead_are_brought_to_this_one(ahead_s: float)
         now_s += 0.05
         late.append(now_s - stamps.here(now_s - 0.001 + ahead_s, now_s))
     assert all(abs(late_s) < 0.005 for late_s in late)
+
+
+def ages_by_stamps(
+    of: Callable[[float], float], seconds: float = 60.0, jump_s: float = 0.0
+) -> list[float | None]:
+    """How old frames are by a clock that shows `of(time)`, of which each is read after 0 to 20 ms,
+    in the last quarter of some time; in its middle this computer's clock is set. None: nobody
+    knows.
+    """
+    stamps, now_s, set_s = Stamps(), 1_700_000_000.0, 0.0
+    late = []
+    for number in range(int(seconds * 20)):
+        sent_s = 0.05 * number
+        if number == int(seconds * 10):
+            set_s = jump_s
+        read_s = now_s + set_s + sent_s + 0.001 * (number * 8 % 21)
+        stamps.note_empty(read_s)
+        came_s = stamps.here(of(sent_s), read_s)
+        late.append(None if came_s is None else read_s - came_s)
+    return late[-len(late) // 4 :]
+
+
+@pytest.mark.parametrize(
+    "of",
+    [
+        lambda sent_s: sent_s,
+        lambda sent_s: sent_s + 86_400.0,
+        lambda sent_s: (sent_s + 4270.0) % (2**32 * 1e-6),  # microseconds in 32 bits
+        lambda sent_s: round(sent_s, 3),
+        lambda sent_s: (1.0 + 1e-4) * sent_s,
+    ],
+)
+def test_stamps_that_count_from_any_moment_are_brought_to_this_computers_clock(
+    of: Callable[[float], float],
+) -> None:
+    """Those of PEAK, candleLight and others count from the adapter's start. Frames had the time of
+    their reading: a computer that was busy cut sweeps, and the bus and the boards were accused."""
+    late = [one for one in ages_by_stamps(of) if one is not None]
+    assert len(late) == len(ages_by_stamps(of))
+    assert min(late) >= 0.0
+    assert max(late) == pytest.approx(0.02, abs=0.006)
+    assert min(late) < 0.004
+
+
+@pytest.mark.parametrize("jump_s", [-1e6, -5000.0, 5000.0, 1e9])
+def test_a_computer_whose_clock_is_set_by_hours_goes_on_with_the_adapters_stamps(
+    jump_s: float,
+) -> None:
+    """As one without a battery for its clock does once it reaches the network."""
+    late = ages_by_stamps(lambda sent_s: 1_700_000_000.0 + sent_s, jump_s=jump_s)
+    assert max(one for one in late if one is not None) == pytest.approx(0.02, abs=0.003)
+
+
+@pytest.mark.parametrize(
+    "of",
+    [
+        lambda _: 0.0,
+        lambda _: float("nan"),
+        lambda _: float("inf"),
+        lambda sent_s: 1e3 * sent_s,  # of another unit
+        lambda sent_s: -sent_s,
+        lambda sent_s: 7919.0 * (sent_s * 1e4 % 101),
+    ],
+)
+def test_stamps_that_are_none_never_count(of: Callable[[float], float]) -> None:
+    assert set(ages_by_stamps(of)) == {None}

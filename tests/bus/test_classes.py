@@ -84,7 +84,8 @@ def test_boards_that_another_node_reads_are_no_strangers():
     sent = frames(values(2), PERIOD) + frames(values(2), PERIOD, board=2)
     sweeps = feed(assembler, sent + frames(values(1), PERIOD, board=9))
     assert [sweep.board for sweep in sweeps] == [0]
-    assert assembler.counters.other == 4
+    feed(assembler, [(0x123, bytes(8), PERIOD)])
+    assert (assembler.counters.other, assembler.elsewhere) == (5, 4)
     assert assembler.counters.unknown_board == 2
     assert assembler.unconfigured == {9: 2}
 

@@ -128,6 +128,18 @@ def test_a_buffer_smaller_than_wanted_is_said_once(ends, caplog):
     assert "sysctl -w net.core.rmem_max=2147483647" in record.getMessage()
 
 
+def test_a_loose_plug_repeats_nothing_of_the_buffer(caplog):
+    """Each time the device was back, there was a line of it."""
+    buses = [pair() for _ in range(5)]
+    port = port_on(buses[0][0], Receive(buffer_bytes=2**31 - 1))
+    for ours, _ in buses[1:]:
+        port._use(ours)
+    assert len([one for one in caplog.messages if "rmem_max" in one]) == 1
+    for ends in buses:
+        for end in ends:
+            end.shutdown()
+
+
 def test_error_frames_are_counted_and_move_the_state(ends):
     ours, theirs = ends
     port = port_on(ours)
@@ -335,8 +347,18 @@ async def test_a_transmit_queue_that_stays_full_is_an_error(monkeypatch):
     monkeypatch.setattr("skin_host.bus.port.SEND_DEADLINE_S", 0.02)
     with FullQueue(1 << 30) as bus:
         port = AdapterPort("left", Bus(interface="x"), bus)
-        with pytest.raises(BusError, match="termination"):
+        with pytest.raises(BusError, match=r"termination$"):
             await port.send([(0x20E, b"")])
+
+
+async def test_of_a_network_interface_the_command_that_shows_more_is_named(monkeypatch):
+    monkeypatch.setattr("skin_host.bus.port.SEND_DEADLINE_S", 0.02)
+    ours, theirs = pair()
+    monkeypatch.setattr(ours, "send", FullQueue(1 << 30).send)
+    with pytest.raises(BusError, match=r"termination \(`ip -details .* link show can0`\)$"):
+        await port_on(ours).send([(0x20E, b"")])
+    ours.shutdown()
+    theirs.shutdown()
 
 
 def test_python_cans_socketcan_under_another_name_is_read_in_batches():

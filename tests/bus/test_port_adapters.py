@@ -15,10 +15,12 @@ from skin_host.bus.adapters import CAPACITY, AdapterPort, nanoseconds
 from skin_host.bus.multicast import MulticastBus
 from skin_host.bus.opening import open_bus, open_port
 from skin_host.bus.port import LinkState, Port
+from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError
 from tests.support.datagrams import FRAME
+from tests.support.sweeps import frames, make, values
 from tests.support.waiting import PATIENCE_S
 
 _numbers = itertools.count()
@@ -195,6 +197,275 @@ def test_an_unplugged_adapter_is_opened_again(caplog):
         assert len(port.read()) == 1
     assert port.counters.removals == port.counters.reopened == 1
     port.close()
+
+
+class Pulled(can.BusABC):
+    """An unplugged adapter as the libraries of Kvaser and of candleLight show it: reading finds no
+    frame, as on a bus that is silent, and only sending fails.
+    """
+
+    def __init__(self, error: Exception) -> None:
+        super().__init__("pulled")
+        self.error = error
+
+    def _recv_internal(self, timeout):
+        return None, False
+
+    def send(self, msg, timeout=None):
+        raise self.error
+
+
+def caused(cause: OSError) -> can.CanOperationError:
+    error = can.CanOperationError("The message could not be sent")
+    error.__cause__ = cause
+    return error
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        can.CanOperationError("Hardware error detected", -15),  # canERR_HARDWARE
+        can.CanOperationError("Handle is invalid", -10),  # canERR_INVHANDLE
+        caused(OSError(19, "No such device")),
+        OSError(5, "Input/Output Error"),
+    ],
+)
+async def test_an_unplugged_adapter_that_only_sending_shows_is_opened_again(error):
+    """It was silent until the daemon was started again."""
+    settings = Bus(interface="virtual", channel=f"adapters-{next(_numbers)}")
+    other = Bus(interface="kvaser", channel="0")
+    port = AdapterPort("left", other, Pulled(error))
+    assert len(port.read()) == 0
+    with pytest.raises(BusError, match=r"cannot send"):
+        await port.send([(0x20E, b"\x07\x00")])
+    assert port.state is LinkState.GONE
+    assert port.counters.removals == 1
+    port._settings = settings  # it is plugged in again
+    read_until(port, LinkState.UP)
+    port.close()
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        can.CanOperationError("Transmit buffer overflow", -13),  # canERR_TXBUFOFL
+        can.CanOperationError("The transmit queue is full"),
+        caused(OSError(110, "Operation timed out")),
+    ],
+)
+async def test_an_adapter_without_room_for_a_frame_is_there(error, monkeypatch):
+    monkeypatch.setattr("skin_host.bus.port.SEND_DEADLINE_S", 0.02)
+    port = AdapterPort("left", Bus(interface="kvaser", channel="0"), Pulled(error))
+    with pytest.raises(BusError, match="termination"):
+        await port.send([(0x20E, b"\x07\x00")])
+    assert port.state is LinkState.UP
+    assert port.counters.send_retries > 0
+    port.close()
+
+
+def of_library(interface: str, *messages: can.Message) -> tuple[AdapterPort, list[int]]:
+    """A port of a library that has read these messages, and the identifiers that it returns."""
+    waiting = list(messages)
+
+    class Library(can.BusABC):
+        def __init__(self) -> None:
+            super().__init__("library")
+
+        def _recv_internal(self, timeout):
+            return (waiting.pop(0) if waiting else None), False
+
+        def send(self, msg, timeout=None):
+            pass
+
+    port = AdapterPort("left", Bus(interface=interface, channel="0"), Library())
+    return port, port.read().id.tolist()
+
+
+def test_frames_that_a_library_returns_to_their_sender_are_not_received():
+    """That of candleLight returns each: they were recorded twice, and counted as others'."""
+    own = message(0x20E, b"\x07\x00", is_rx=False)
+    port, received = of_library("gs_usb", own, message(0x410, bytes(8)))
+    assert received == [0x410]
+    assert port.counters.frames == 1
+
+
+@pytest.mark.parametrize(
+    ("interface", "passive", "overflows"), [("pcan", False, 0), ("gs_usb", True, 1)]
+)
+def test_an_error_frame_has_the_meaning_that_its_library_gives_it(interface, passive, overflows):
+    """PEAK's have the kind of a bit error, and its place in the frame: here 4, of the stuffing, at
+    place 17."""
+    error = can.Message(arbitration_id=4, data=[0, 0x11, 0, 0], is_error_frame=True)
+    port, received = of_library(interface, error)
+    assert len(received) == 1
+    assert port.counters.error_frames == 1
+    assert (port.state is LinkState.ERROR_PASSIVE) is passive
+    assert port.counters.controller_overflows == overflows
+
+
+class Sending(can.BusABC):
+    """A library of an adapter whose frames come at their time; it stamps them when they are read,
+    or, with an offset (s), by a clock of its own.
+    """
+
+    def __init__(
+        self,
+        clock: SteppedClock,
+        sent: list[tuple[int, bytes, int]],
+        own_s: float | None = None,
+    ) -> None:
+        super().__init__("sending")
+        self._clock = clock
+        self._began_ns = clock.now_ns()
+        self._own_s = own_s
+        self._sent = sorted(sent, key=lambda frame: frame[2])
+
+    def _recv_internal(self, timeout):
+        came_ns = self._began_ns + self._clock.since_boot_ns()
+        if not self._sent or self._sent[0][2] > came_ns:
+            return None, False
+        identifier, data, t_ns = self._sent.pop(0)
+        stamp_s = self._clock.now_ns() * 1e-9
+        if self._own_s is not None:
+            stamp_s = t_ns * 1e-9 + self._own_s
+        return message(identifier, data, timestamp=stamp_s), False
+
+    def send(self, msg, timeout=None):
+        pass
+
+
+@pytest.mark.parametrize("own_s", [0.0, -1_699_999_000.0])
+@pytest.mark.parametrize("step_s", [0.3, 2.0, 1800.0, 5000.0, -0.3, -2.0, -1800.0, -5000.0])
+def test_an_adapters_stamps_follow_this_computers_clock_when_it_is_set(own_s, step_s):
+    """Sweeps seemed to be as old as that for up to four seconds, and were cut."""
+    clock = SteppedClock()
+    began_ns = clock.now_ns()
+    sent = [(0x4E0, bytes(8), began_ns + number * 50_000_000) for number in range(200)]
+    port = AdapterPort(
+        "left", Bus(interface="pcan", channel="0"), Sending(clock, sent, own_s), clock
+    )
+    set_ns, n = 0, 0
+    for turn in range(400):
+        if turn == 200:
+            clock.set(step_s)
+            set_ns = round(step_s * 1e9)
+        for t_ns in port.read().t_ns.tolist():
+            came_ns = sent[n][2] + set_ns
+            n += 1
+            assert -1_000_000 <= t_ns - came_ns <= 26_000_000
+            # Set back, it needs some frames that are read at once.
+            if n > 45 and abs(step_s) < 3600 and not 100 <= n <= 140:
+                assert abs(t_ns - came_ns) < 3_000_000
+        clock.advance(0.0253)
+    assert n == 200
+    port.close()
+
+
+def test_frames_of_a_read_are_in_order_also_as_the_adapters_clock_becomes_known():
+    """A sweep was cut then: its first frames seemed to be newer than the others."""
+    clock = SteppedClock()
+    began_ns = clock.now_ns()
+    sweeps = [began_ns + number * 50_000_000 for number in range(100)]
+    sent = [(0x4E0 + i, bytes(8), t_ns + i * 111_000) for t_ns in sweeps for i in range(8)]
+    library = Sending(clock, sent, own_s=-1_699_999_000.0)
+    port = AdapterPort("left", Bus(interface="pcan", channel="0"), library, clock)
+    found: list[int] = []
+    for _ in range(200):
+        clock.advance(0.0253)
+        found += port.read().t_ns.tolist()
+    assert len(found) == 800
+    assert found == sorted(found)
+    assert found[-1] == pytest.approx(sent[-1][2], abs=3_000_000)
+    port.close()
+
+
+def read_at(
+    times_ms: list[float], sent: list[tuple[int, bytes, float]]
+) -> tuple[list[FrameBatch], list[list[float]]]:
+    """What reads at some times return, and the times that they give the frames; all in ms."""
+    clock = SteppedClock()
+    began_ns = clock.now_ns()
+    on_bus = [(number, data, began_ns + round(t_ms * 1e6)) for number, data, t_ms in sent]
+    port = AdapterPort("left", Bus(interface="slcan", channel="0"), Sending(clock, on_bus), clock)
+    batches, found = [], []
+    for t_ms in times_ms:
+        clock.advance(t_ms * 1e-3 - (clock.now_ns() - began_ns) * 1e-9)
+        batch = port.read()
+        batches.append(
+            FrameBatch(
+                *(one.copy() for one in (batch.id, batch.dlc, batch.data)), batch.t_ns.copy()
+            )
+        )
+        found.append([round((t_ns - began_ns) * 1e-6, 3) for t_ns in batch.t_ns.tolist()])
+    port.close()
+    return batches, found
+
+
+def sweep_of(board: int, t_ms: float, triangles: int = 4) -> list[tuple[int, bytes, float]]:
+    """The frames of a sweep that begins at a time, in ms; each takes 0.125."""
+    raw = values(triangles, board)
+    return [
+        (number, data, t_ns * 1e-6) for number, data, t_ns in frames(raw, round(t_ms * 1e6), board)
+    ]
+
+
+def test_a_sweep_that_a_read_finds_half_sent_is_not_cut_by_the_next():
+    """Reads are up to 26 ms apart. Such a sweep lasted for more than half of its period, so it was
+    taken for two, again and again: single frames seemed lost, and a board seemed to send twice as
+    often. A board that goes first may come between.
+    """
+    late, first = sweep_of(2, 9.6), sweep_of(1, 10.1)
+    late[4:] = [(*one[:2], one[2] + 1.0) for one in late[4:]]
+    batches, times = read_at([1.0, 10.05, 36.0, 60.0], late + first)
+    assert [len(one) for one in times] == [0, 4, 12, 0]
+    assert times[1] == [10.05] * 4
+    assert times[2] == pytest.approx([10.05 + 0.111 * n for n in range(1, 13)])
+    assembler = make("0-3", boards=2)
+    sweeps = [sweep for batch in batches for sweep in assembler.feed(batch).sweeps]
+    assert sorted(sweep.board for sweep in sweeps) == [0, 1]
+    assert {sweep.present for sweep in sweeps} == {0b1111}
+    assert assembler.counters.incomplete == assembler.counters.halves == 0
+
+
+def test_frames_behind_those_of_a_sweep_that_was_half_sent_come_when_they_are_read():
+    others = [(0x123, b"\x40", 20.0), (0x124, b"\x40", 20.0), *sweep_of(1, 34.0)]
+    _, times = read_at([1.0, 10.05, 36.0], sweep_of(2, 9.6) + others)
+    assert times[2] == [pytest.approx(10.05 + 0.111 * n) for n in range(1, 5)] + [36.0] * 10
+
+
+@pytest.mark.parametrize("apart_ms", [15.0, 25.0, 50.0])
+def test_a_sweep_is_not_dated_by_the_one_before(apart_ms):
+    """It has the same frames: nothing shows that it followed at once."""
+    sent = [*sweep_of(1, 8.0), *sweep_of(1, 8.0 + apart_ms), *sweep_of(1, 8.0 + 2 * apart_ms)]
+    reads = [1.0, *(10.0 + number * apart_ms for number in range(3))]
+    _, times = read_at(reads, sent)
+    assert times == [[], *([t_ms] * 8 for t_ms in reads[1:])]
+
+
+@pytest.mark.parametrize("pause_ms", [31.0, 300.0])
+def test_what_waited_while_this_computer_was_busy_did_not_follow_at_once(pause_ms):
+    _, times = read_at([1.0, 10.05, 10.05 + pause_ms], sweep_of(1, 9.6))
+    assert times[2] == [10.05 + pause_ms] * 4
+
+
+@pytest.mark.parametrize(
+    ("interface", "stamp_s", "late"),
+    [
+        ("kvaser", 0.0, False),
+        ("pcan", 0.0, False),
+        ("pcan", -1e6, True),
+        ("slcan", 0.0, True),
+        ("virtual", 0.0, True),
+    ],
+)
+def test_a_busy_computer_moves_no_stamps_of_an_adapters_own_clock(interface, stamp_s, late):
+    """Whatever is amiss on its bus was put down to a pause of 50 ms of this computer."""
+    stamped = message(0x410, bytes(8), timestamp=time.time() + stamp_s)
+    port, received = of_library(interface, stamped)
+    assert received == [0x410]
+    assert port.stamps_late is late
+    assert len(port.read()) == 0
+    assert port.stamps_late is late
 
 
 def test_buses_by_multicast_do_not_hear_each_other():

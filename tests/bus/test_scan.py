@@ -18,6 +18,9 @@ ANSWERS = [
     (14, Discovered(BoardType.MTB4, 1, 2, 3)),
     (9, DiscoveredBootloader(BoardType.SKIN, 4, 5)),
     (10, Discovered(77, 6, 7, 8)),
+    # Another one at the same address, and an answer that came twice.
+    (10, Discovered(BoardType.MTB4, 6, 7, 8)),
+    (10, Discovered(BoardType.MTB4, 6, 7, 8)),
 ]
 STREAMING, TRIANGLES = 5, np.array([0, 3])
 
@@ -62,14 +65,17 @@ async def test_boards_are_listed_by_address_with_what_they_run_and_send(
             (STREAMING, "unknown", None, TRIANGLES.tolist()),
             (9, "skin", None, []),
             (10, "type 77", "6.7.8", []),
+            (10, "mtb4", "6.7.8", []),
             (14, "mtb4", "1.2.3", []),
         ]
     ]
-    rows = scan_table(found, "can0").splitlines()
+    *rows, last = scan_table(found, "can0").splitlines()
+    assert last == "2 boards answer at address 10: give each one of its own"
     assert [row.split() for row in rows[1:]] == [
         ["5", "unknown", "-", "0,3"],
         ["9", "skin", "bootloader", "-"],
         ["10", "type", "77", "6.7.8", "-"],
+        ["10", "mtb4", "6.7.8", "-"],
         ["14", "mtb4", "1.2.3", "-"],
     ]
 

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from skin_host.cli import main
-from skin_host.cli.lines import missed_line
+from skin_host.cli.lines import event_line, missed_line
 from skin_host.client import session
 from skin_host.config.settings import Mqtt, load
 from skin_host.fingertip.events import Over, Slip
@@ -46,6 +46,14 @@ index          slip  #4    ends
 index          over  #4    begins: 10.40 N normal
 index          end   #4    (   1.0,   2.0) mm
 """.splitlines()
+
+
+def test_a_line_shows_what_is_not_known_of_a_touch() -> None:
+    bound = replace(BEGUN, taxels=[3], peak_kpa=12.0, partial=True)
+    assert "12.0 kPa  ≥2.00 N" in event_line(bound)
+    assert "≥" not in event_line(replace(bound, partial=False))
+    assert event_line(BEGUN.ended(9, 9, "lost")).endswith("lost: it may still last")
+    assert event_line(BEGUN.ended(9, 9)).endswith(" mm")
 
 
 def info() -> NodeInfo:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from skin_host.cli import main
+from skin_host.cli import main, operate
+from tests.support.broker import free_port
 
 
 @pytest.fixture
@@ -24,6 +25,58 @@ def test_a_scan_that_nobody_answers_has_failed(
     assert line.startswith(f"skin scan: {group[-1]}: nobody answered")
     assert "powered" in line
     assert (json.loads(told.out) if more else told.out) == ({"boards": []} if more else "")
+
+
+def test_a_scan_has_the_options_of_its_bus(capsys: pytest.CaptureFixture[str]) -> None:
+    """A server of buses has a host and a port: without, it could not be scanned."""
+    options = ["--option", "host=127.0.0.1", "--option", f"port={free_port()}"]
+    assert main(["scan", "--interface", "socketcand", *options]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('skin scan: bus "scan": socketcand can0: cannot be opened: ')
+    assert "refused" in line
+
+
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [
+        ("host=10.0.0.5", "10.0.0.5"),
+        ("port=29536", 29536),
+        ("timeout=0.5", 0.5),
+        ("rtscts=true", True),
+        ("listen_only=false", False),
+        ("serial=0x1F", "0x1F"),
+        ("unique_hardware_id=nan", "nan"),
+        ("app_name=", ""),
+        ("url=a=b", "a=b"),
+    ],
+)
+def test_an_option_of_a_bus_is_read_as_in_a_configuration(text: str, read: object) -> None:
+    key, value = operate._option(text)
+    assert (key, value) == (text.partition("=")[0], read)
+    assert type(value) is type(read)
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--option", "host"], "seen host, wanted KEY=VALUE such as host=10.0.0.5"),
+        (["--option", "=1"], "seen =1, wanted KEY=VALUE"),
+        (["--bitrate", "999"], "seen 999, wanted a whole number from 1000 to 10000000"),
+    ],
+)
+def test_what_is_no_option_of_a_bus_is_refused(
+    options: list[str], why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["scan", *options])
+    assert end.value.code == 2
+    assert why in capsys.readouterr().err
+
+
+def test_a_channel_that_steers_a_terminal_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scan", "--channel", "can0\x1b[2J"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "channel: seen 'can0\\x1b[2J', wanted" in line
 
 
 @pytest.mark.parametrize(

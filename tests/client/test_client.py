@@ -24,6 +24,7 @@ from skin_host.client.session import LEAST_STALE_S
 from skin_host.config.settings import Mqtt, changed, load
 from skin_host.errors import BrokerError, RequestError, SkinError, StateError
 from skin_host.layout import build_layout
+from skin_host.mqtt.address import Broker
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import Touch
@@ -252,6 +253,40 @@ async def test_a_client_hears_what_was_said_while_its_link_was_cut(
             publisher.put_touch(touch(5))
             seen = await take(touches, 4)
             assert [(one.count, one.missed) for one in seen] == [(2, 0), (3, 0), (4, 0), (5, 0)]
+
+
+async def test_events_that_the_broker_keeps_do_not_wait_behind_states(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """Its room is limited, health comes every second, and a state that was kept is an old one."""
+    broker = Mosquitto(mosquitto.program, tmp_path, "max_queued_messages 50\n")
+    broker.start()
+    try:
+        async with publishing(broker) as publisher, hearing(broker) as skin:
+            touches, contacts, health = skin.touches(), skin.contacts(), skin.health()
+            await skin.ready()
+            publisher.put_touch(touch(1))
+            await take(touches, 1)
+            link = skin._links[0]
+            there, link.broker = link.broker, Broker(broker.host, free_port())
+            link.connection.cut()  # type: ignore[union-attr]
+            await until(lambda: not skin.connected)
+            async with aiomqtt.Client(broker.host, broker.port) as somebody:
+                for _ in range(100):
+                    old = json.encode({"schema": "skin.health/1", "state": "ok"})
+                    await somebody.publish("skin/robot/palm/health", old, qos=1)
+                    await somebody.publish("skin/robot/palm/contact", b"OFF", qos=1)
+            publisher.put_touch(touch(2))
+            await until(lambda: publisher.counters.touches_sent == 2)
+            link.broker = there
+            await until(lambda: skin.connected)
+            publisher.put_touch(touch(3))
+            assert [one.count for one in await take(touches, 1)] == [2]
+            publisher.put_health("palm", {"state": "silent"})
+            assert (await take(health, 1))[0].state == "silent"
+            del contacts
+    finally:
+        broker.kill()
 
 
 async def test_a_client_survives_the_broker(mosquitto: Mosquitto) -> None:

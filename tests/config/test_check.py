@@ -59,6 +59,26 @@ def test_a_slower_bus_is_loaded_more() -> None:
     assert list(slow) == pytest.approx([2 * load for load in fast], abs=2e-3)
 
 
+@pytest.mark.parametrize(
+    ("bus", "warns"),
+    [
+        ({}, False),
+        ({"bitrate": 500_000}, True),
+        ({"interface": "slcan", "bitrate": 250_000}, True),
+        ({"interface": "udp_multicast", "channel": "239.74.163.2", "bitrate": 500_000}, False),
+    ],
+)
+def test_a_bit_rate_that_no_board_has_is_warned_of(bus: dict[str, object], warns: bool) -> None:
+    """An adapter that sets it would disturb its bus, and receive nothing."""
+    warnings = described(
+        {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}},
+        {"arm": {"patches": [{"board": "mtb", "triangles": "0-3"}]}},
+        {"can0": bus},
+    )["warnings"]
+    seen = [one for one in warnings if one.startswith("buses.can0.bitrate: ")]
+    assert len(seen) == len(warnings) == int(warns)
+
+
 def test_a_period_shorter_than_the_chips_conversion_is_warned_of() -> None:
     (warning,) = full_boards(1, period_ms=20)["warnings"]
     assert warning.startswith("boards.mtb1.period_ms: 20; the chips need 36.86 ms")
@@ -230,6 +250,21 @@ def test_two_buses_on_one_channel_are_a_warning():
     boards = {name: {"bus": name, "address": 1, "skin_type": 2} for name in buses}
     parts = {name: {"patches": [{"board": name, "triangles": "0"}]} for name in buses}
     (warning,) = described(boards, parts, buses)["warnings"]
+    assert warning.startswith("buses.b.channel: can0 is that of buses.a too")
+
+
+def test_buses_of_one_name_on_two_servers_are_none() -> None:
+    buses: dict[str, object] = {
+        name: {"interface": "socketcand", "options": {"host": host, "port": 29536}}
+        for name, host in (("a", "10.0.0.1"), ("b", "10.0.0.2"))
+    }
+    boards: dict[str, dict[str, object]] = {
+        name: {"bus": name, "address": 1, "skin_type": 2} for name in buses
+    }
+    parts = {name: {"patches": [{"board": name, "triangles": "0"}]} for name in buses}
+    assert described(boards, dict(parts), buses)["warnings"] == []
+    buses["b"] = buses["a"]
+    (warning,) = described(boards, dict(parts), buses)["warnings"]
     assert warning.startswith("buses.b.channel: can0 is that of buses.a too")
 
 

@@ -90,7 +90,9 @@ async def test_a_client_prints_a_touch(mosquitto: Mosquitto) -> None:
     ("words", "said"),
     [
         (["client.py", "http://x"], "the URL of the broker"),
+        (["ros2_node.py"], "No module named 'rclpy': wanted ROS 2"),
         (["stop_on_touch.py"], "which part?"),
+        (["stop_on_touch.py", "left_hand", "mqtt://localhost", "demo"], "which part?"),
         (["stop_on_touch.py", "mqtt://localhost:1"], "which part?"),
         (["stop_on_touch.py", "left_hand", "http://x"], "the URL of the broker"),
     ],
@@ -249,6 +251,20 @@ def test_the_example_for_ros_without_a_broker_ends_with_one_line(
     monkeypatch.setattr(sys, "argv", ["ros2_node.py", "http://x"])
     with pytest.raises(SystemExit, match="the URL of the broker"):
         runpy.run_path(str(EXAMPLES / "ros2_node.py"))
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, ros.ExternalShutdownException])
+def test_the_example_for_ros_ends_quietly_with_ctrl_c_and_when_ros_shuts_down(
+    monkeypatch: pytest.MonkeyPatch, end: type[BaseException]
+) -> None:
+    ros.install(monkeypatch, enough=0)
+    monkeypatch.setattr(sys.modules["rclpy"], "spin", MagicMock(side_effect=end))
+    skin = MagicMock()
+    skin.return_value.__exit__.return_value = None
+    monkeypatch.setattr(client, "SkinCallbacks", skin)
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py"])
+    runpy.run_path(str(EXAMPLES / "ros2_node.py"))
+    skin.return_value.__exit__.assert_called_once()
 
 
 @pytest.mark.parametrize("part", ["left-hand", "2nd", "arm"])

@@ -1,6 +1,7 @@
 """The plain subscriber follows the rules of docs/subscribers.md, at a real broker."""
 
 import asyncio
+import runpy
 import signal
 import sys
 from collections.abc import AsyncIterator
@@ -169,6 +170,19 @@ async def test_what_a_broker_delivers_late_is_not_known(mosquitto: Mosquitto) ->
         # By another connection of the daemon its clock may have been set.
         await demo.health(f"6.{second_ns}")
         assert await program.lines_to_marker(demo) == [f"{NAME} OFF"]
+
+
+@pytest.mark.parametrize("ppm", [-100, 0, 100])
+def test_two_clocks_that_run_apart_make_nothing_late(ppm: int) -> None:
+    """Nor hide that a broker is held up, after days of one connection."""
+    part = runpy.run_path(str(EXAMPLES / "subscriber.py"))["Part"]()
+    for hour in range(100):
+        now_s = 3600.0 * hour
+        since_ns = round(now_s * (1e9 + 1e3 * ppm))
+        part.take_sign(now_s, f"5.{since_ns}")
+        assert part.alive_s == now_s
+    part.take_sign(now_s + 10.0, f"5.{since_ns + 1}")
+    assert part.alive_s == now_s
 
 
 async def test_states_of_a_node_that_is_offline_are_out_of_date(mosquitto: Mosquitto) -> None:

@@ -69,7 +69,10 @@ def test_a_bus_of_an_emulated_robot_has_no_plug_to_check(
     ("gained", "code", "words"),
     [
         ({"dropped": 7}, "bus_drops", "lost 7 frames"),
+        ({"overflows": 2, "error_frames": 2}, "bus_drops", "its controller, or the driver of that"),
+        ({"dropped": 7, "overflows": 2}, "bus_drops", "second, and its controller, or the driver"),
         ({"error_frames": 3}, "bus_errors", "3 error frames"),
+        ({"error_frames": 5, "overflows": 2}, "bus_errors", "3 error frames"),
         ({"wrong": 2}, "bus_bit_errors", "2 with a wrong header"),
         ({"other_load": 0.9}, "bus_babbling", "90%"),
     ],
@@ -78,6 +81,20 @@ def test_what_a_bus_lost_in_the_last_second_is_counted(
     calibrated: FaultBench, gained: dict[str, float], code: str, words: str
 ) -> None:
     assert words in found(calibrated, gained=gained)[code].sentence
+
+
+def test_a_controller_that_loses_frames_is_no_fault_of_the_wiring(calibrated: FaultBench) -> None:
+    """It reports each loss in an error frame. Termination and load of the bus were accused."""
+    gained = {"overflows": 2, "error_frames": 2, "halves": 9}
+    assert "bus_errors" not in found(calibrated, gained=gained)
+
+
+def test_frames_that_were_lost_here_are_no_fault_of_the_bus(calibrated: FaultBench) -> None:
+    record: Any = copy.deepcopy(calibrated.records["left_hand"])
+    record["buses"][0]["last_second"]["halves"] = 9
+    assert "bus_loses_frames" in {fault.code for fault in diagnose(record)}
+    record["buses"][0]["lost_here"] = True
+    assert "bus_loses_frames" not in {fault.code for fault in diagnose(record)}
 
 
 def test_error_frames_of_a_bus_that_is_off_are_no_second_fault(calibrated: FaultBench) -> None:

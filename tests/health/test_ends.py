@@ -17,6 +17,7 @@ from skin_host.bus.port import LinkState, PortCounters
 from skin_host.bus.wire import FrameBatch
 from skin_host.health import LATELY_NS, HealthWatch
 from skin_host.processing.calibration import Verdict
+from skin_host.processing.core import Engine
 from tests.support.fault_bench import FaultBench
 
 PAGE = (Path(__file__).parents[2] / "docs/operations.md").read_text()
@@ -103,6 +104,7 @@ PORTS: list[tuple[LinkState, dict[str, int], str]] = [
     (LinkState.DOWN, {}, "bus_down"),
     (LinkState.GONE, {}, "bus_gone"),
     (LinkState.UP, {"dropped": 3}, "bus_drops"),
+    (LinkState.UP, {"controller_overflows": 1, "error_frames": 1}, "bus_drops"),
 ]
 #: Counters of the ledger -> what is reported, for a minute.
 EVENTS = {
@@ -212,6 +214,71 @@ def test_a_fault_of_a_port_is_over_when_it_works(
     port.state = LinkState.UP
     seen = [codes(health, now_ns + n * S // 10, ports=ports) for n in range(2, 60)]
     assert code not in seen[-1]
+
+
+def second_of(
+    frame: tuple[int, bytes], n: int, parts: list[int] | None = None, **counted: int
+) -> tuple[set[str], Any]:
+    """What is reported, and the record, after a second in which a bus brought so many frames; of a
+    node that reads some parts only.
+    """
+    bench, port = FaultBench(3.0), Seen()
+    if parts is not None:
+        bench.engine = Engine(bench.engine.settings, bench.layout, parts)
+        bench.health = HealthWatch(bench.engine)
+    layout, ledger = bench.layout, bench.engine.ledger
+    ports: Any = {"can0": port}
+    assembler = bench.engine.assemblers["can0"]
+    boards: Any = {
+        "can0": Boards(
+            "can0",
+            Silent(),
+            [(i, layout.boards[i]) for i in bench.engine.boards],
+            layout.triangles,
+            ledger,
+            unconfigured=assembler.unconfigured,
+        )
+    }
+    codes(bench.health, bench.now_ns, ports=ports, boards=boards)
+    for number in range(n // 100):
+        t_ns = bench.now_ns + number * S * 100 // n
+        bench.engine.feed("can0", FrameBatch.of([(*frame, t_ns)] * 100))
+    for name, gain in counted.items():
+        setattr(port.counters, name, gain)
+    now_ns = bench.now_ns + S
+    bench.health.tick(now_ns, ports, boards)
+    record = bench.health.record(0, now_ns, ports, boards)
+    return {fault["code"] for fault in record["faults"]}, record
+
+
+def test_reports_of_the_controller_take_nothing_of_its_bus() -> None:
+    """A controller may report some thousand errors a second, of which no other node sends one."""
+    error = (0x20000008, bytes(8))
+    reported, record = second_of(error, 5000, error_frames=5000)
+    assert "bus_errors" in reported
+    assert "bus_babbling" not in reported
+    assert record["buses"][0]["last_second"]["load"] == 0.0
+
+
+def test_boards_of_another_node_do_not_fill_their_bus() -> None:
+    """A node with one board beside six of another node sent its operator to look for them."""
+    # Part 0 is the hand at address 14; this is triangle 3 of the forearm, at 13.
+    reported, record = second_of((0x4D3, b"\x40" + bytes(7)), 5000, parts=[0])
+    assert "bus_babbling" not in reported
+    recent = record["buses"][0]["last_second"]
+    assert (recent["load"], recent["other_load"]) == (0.605, 0.0)
+
+
+def test_a_board_that_is_not_configured_and_fills_its_bus_is_named() -> None:
+    """Only frames that are not of skin were frames of others: the boards behind it were blamed."""
+    reported, record = second_of((0x413, b"\x40" + bytes(7)), 5000)
+    assert "bus_babbling" in reported
+    (sentence,) = (one for one in record["sentences"] if "other devices" in one)
+    assert "60% of it, mostly with identifier 0x410-0x41f" in sentence
+    # Of a few frames of it among many of others, the others are named.
+    reported, record = second_of((0x123, bytes(8)), 5000)
+    (sentence,) = (one for one in record["sentences"] if "other devices" in one)
+    assert "mostly with identifier 0x123" in sentence
 
 
 @pytest.mark.parametrize(("counter", "code"), EVENTS.items())

@@ -180,6 +180,7 @@ def test_what_a_bus_gained_adds_up_all_that_was_unknown_or_damaged() -> None:
     counters.wrong_header, counters.short, port.counters.damaged = 1, 4, 20
     counters.halves, counters.missed = 6, 7
     port.counters.dropped, port.counters.error_frames = 8, 13
+    port.counters.controller_overflows = 5
     engine.intake.liveness.spikes[:, 3] = 1
     watch.tick(100 * MS, ports, {})
     boards = [one for one in engine.boards if layout.boards[one].settings.bus == bus]
@@ -187,15 +188,42 @@ def test_what_a_bus_gained_adds_up_all_that_was_unknown_or_damaged() -> None:
         "frames": 100,
         "sweeps": 9,
         "other": 11,
+        "elsewhere": 0,
         "wrong": 1 + 4 + 20,
         "halves": 6,
         "missed": 7,
         "unknown": 2 + 3,
+        "unconfigured": 2,
         "spikes": 16 * len(boards),
         "dropped": 8,
+        "overflows": 5,
         "error_frames": 13,
         "seconds": pytest.approx(0.1),
     }
+
+
+@pytest.mark.parametrize("counter", ["dropped", "controller_overflows"])
+@pytest.mark.parametrize("set_s", [0, 3600, -3600])
+def test_frames_that_were_lost_here_are_known_until_all_that_lack_them_are_forgotten(
+    counter: str, set_s: int
+) -> None:
+    """Their other halves are counted with the sweep after them, and for a second from then on."""
+    settings = load(CONFIG)
+    engine = Engine(settings, build_layout(settings, CONFIG.parent), [0])
+    watch, port = Watch(engine), Counted()
+    bus = next(iter(engine.assemblers))
+    ports: Any = {bus: port}
+    known = []
+    for turn in range(40):
+        now_ns = turn * 100 * MS + (set_s * S if turn >= 3 else 0)
+        if turn == 2:
+            setattr(port.counters, counter, 1)
+        watch.tick(now_ns, ports, {})
+        known.append(watch.buses[bus].lost_here(now_ns))
+    assert known[:2] == [False] * 2
+    if not set_s:
+        assert known[2:21] == [True] * 19
+    assert known[23:] == [False] * 17
 
 
 def test_pads_that_were_off_for_one_sweep_count_once_each_for_ten_seconds() -> None:

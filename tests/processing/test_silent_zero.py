@@ -447,3 +447,91 @@ def test_a_board_that_is_not_clear_at_once_may_be_so_later() -> None:
         clear.append(test.clear)
     assert not any(clear[:3])
     assert clear[-1]
+
+
+MINUTES = st.floats(200.0, 3600.0)
+
+
+def drifted(
+    moved_units: NDArray[np.float64],
+    silent_s: float,
+    warm_units: float | None = None,
+    noise: float = 0.5,
+) -> NDArray[np.float64] | None:
+    """Return by how much pads that moved so far are taken to have drifted in a silence.
+
+    Args:
+        moved_units: float64[n], of pads of pressure.
+        silent_s: how long it was.
+        warm_units: by how much six temperature pads moved; without it there are none.
+        noise: of all.
+    """
+    n_warm = 0 if warm_units is None else 6
+    n = len(moved_units) + n_warm
+    moved = np.append(moved_units, np.full(n_warm, warm_units or 0.0))
+    rng = np.random.default_rng(1)
+    baseline = rng.uniform(-1.0, 1.0, n)
+    spread = np.full(n, noise)
+    pressure = np.arange(n) < len(moved_units)
+    known = np.ones(n, np.bool_)
+    test = SilentZero(
+        baseline, spread, spread, known, NO_LOAD, PERIOD_S, silent_s, pressure=pressure
+    )
+    for sweep in range(SWEEPS):
+        raw = np.rint(NO_LOAD - baseline - moved - noise * rng.standard_normal(n))
+        t_ns = round(sweep * PERIOD_S * 1e9)
+        test.step(np.clip(raw, 0, 255).astype(np.uint8), known, t_ns)
+    return test.drifted_units()
+
+
+@given(st.floats(-8.0, 5.0), MINUTES)
+def test_each_pad_has_drifted_by_what_it_reads_after_a_long_silence(
+    common_units: float, silent_s: float
+) -> None:
+    most = min(common_units, 0.008 * silent_s)
+    moved = most * np.linspace(0.6, 1.4, 40)
+    found = drifted(moved, silent_s)
+    assert found is not None
+    np.testing.assert_allclose(found, moved, atol=1.0)
+
+
+@given(MINUTES)
+def test_what_a_few_pads_read_more_than_the_others_is_no_drift(silent_s: float) -> None:
+    moved = np.full(40, 1.5)
+    moved[:6] = 8.0
+    found = drifted(moved, silent_s)
+    assert found is not None
+    np.testing.assert_allclose(found, 1.5, atol=1.0)
+
+
+@given(st.floats(2.0, 8.0), st.floats(1.0, 100.0))
+def test_what_rises_faster_than_drift_may_be_a_load(common_units: float, silent_s: float) -> None:
+    assert drifted(np.full(40, common_units), silent_s) is None
+
+
+@given(st.floats(2.0, 8.0), MINUTES)
+def test_what_temperature_pads_do_not_show_may_be_a_load(
+    common_units: float, silent_s: float
+) -> None:
+    moved = np.full(40, common_units)
+    assert drifted(moved, silent_s, warm_units=0.0) is None
+    assert drifted(moved, silent_s, warm_units=common_units) is not None
+
+
+def test_half_of_a_board_that_rose_may_be_a_load() -> None:
+    moved = np.where(np.arange(40) < 26, 3.0, 0.0)
+    assert drifted(moved, 3600.0) is None
+
+
+def test_a_board_that_may_have_drifted_is_not_clear_before_all_sweeps() -> None:
+    """Its pads would be touched until then."""
+    for silent_s, clear in ((10.0, True), (300.0, False)):
+        n = 40
+        baseline = np.random.default_rng(1).uniform(-6.0, 6.0, n)
+        spread = np.full(n, 0.3)
+        known = np.ones(n, np.bool_)
+        test = SilentZero(baseline, spread, spread, known, NO_LOAD, PERIOD_S, silent_s)
+        for sweep in range(SWEEPS - 1):
+            raw = np.rint(NO_LOAD - baseline).astype(np.uint8)
+            assert test.step(raw, known, round(sweep * PERIOD_S * 1e9)) is None
+        assert test.clear is clear

@@ -318,7 +318,7 @@ def test_what_a_full_disk_took_of_a_file_is_named(
         if suffix == ".mcap":
             with Recorder(path) as recorder:
                 for n in range(100_000):
-                    record = {"state": os.urandom(4).hex()}
+                    record = {"schema": "skin.health/1", "state": os.urandom(4).hex()}
                     recorder.say(f"{TOPIC}/health", n, json.dumps(record).encode())
             return
         with CanLog(path) as log:

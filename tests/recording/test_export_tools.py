@@ -1,5 +1,6 @@
 """Recordings as other tools open them: read back by those tools' own loaders."""
 
+import dataclasses
 import json
 import pickle
 import subprocess
@@ -16,7 +17,8 @@ from skin_host.errors import RequestError, SkinError, required
 from skin_host.mqtt.info import FingertipInfo, PartInfo, TriangleInfo
 from skin_host.processing.events import Touch
 from skin_host.recording.export import HealthLine, PartSeries, Series, export
-from skin_host.recording.export.scene import ARROW_M_PER_N, POINT, RecordedScene
+from skin_host.recording.export.known import Gone
+from skin_host.recording.export.scene import ARROW_M_PER_N, POINT, RecordedScene, SkinScene
 from tests.recording.test_export_tables import BEGIN, LOAD, LOST, OVER, SLIP
 from tests.support.rerun import chunks
 
@@ -156,6 +158,26 @@ def test_fingertips_have_arrows_and_what_no_arrow_shows_is_a_line(tmp_path: Path
     assert "TextLog:text" in chunks(RrdReader(tmp_path / "shown.rrd"))["/events"]
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, "#7 1.50 N"),
+        ({"partial": True}, "#7 ≥ 1.50 N"),
+        ({"beyond": True}, "#7 ≥ 1.50 N"),
+        # The board of a fingertip measures what the pads on it do not feel to its end.
+        ({"beyond": True, "load": LOAD}, f"#7 {np.linalg.norm(LOAD.force_n):.2f} N"),
+        (
+            {"load": replace(LOAD, verdict="saturated")},
+            f"#7 ≥ {np.linalg.norm(LOAD.force_n):.2f} N",
+        ),
+    ],
+)
+def test_a_force_that_is_a_bound_is_no_measured_one(changes: dict[str, Any], words: str) -> None:
+    scene = SkinScene({"arm": shape()})
+    (arrow,) = scene.arrows("arm", 1, [replace(touch("begin", 1, 1.5), **changes)]).arrows
+    assert arrow.label == words
+
+
 def test_an_arrow_turns_to_where_a_force_points() -> None:
     from skin_host.recording.export.scene import turned_from_x
 
@@ -176,6 +198,36 @@ def test_rerun_reads_what_was_exported(series: Series, tmp_path: Path) -> None:
     assert "Transform3D:translation" in seen["/robot/hand"]
     assert {"Scalars:scalars"} <= seen["/force_n/arm"] & seen["/kpa/hand"]
     assert "TextLog:text" in seen["/health"]
+
+
+def course(reader: Any, entity: str) -> list[float]:
+    """The numbers of an entity over time."""
+    found = []
+    for chunk in reader.stream():
+        if chunk.entity_path == entity:
+            found += chunk.to_record_batch()["Scalars:scalars"].to_pylist()
+    return [value for (value,) in found]
+
+
+def test_no_force_and_no_pressure_is_0_where_it_is_not_known(
+    series: Series, tmp_path: Path
+) -> None:
+    """In a plot over time a part that died would look untouched."""
+    from rerun.chunk import RrdReader
+
+    begin, _, end = series.touches
+    after_ns = START_NS + N * PERIOD_NS
+    touches = [
+        *(begin, replace(end, reason="released")),
+        *(replace(begin, t_ns=after_ns), replace(end, t_ns=after_ns + 1, reason="lost")),
+        replace(begin, t_ns=after_ns + 2),
+    ]
+    gone = [Gone("arm", after_ns + 3)]
+    export(dataclasses.replace(series, touches=touches, gone=gone), tmp_path / "a.rrd")
+    reader = RrdReader(tmp_path / "a.rrd")
+    forces_n = course(reader, "/force_n/arm")
+    np.testing.assert_array_equal(forces_n, [1.5, 0.0, 1.5, np.nan, 1.5, np.nan])
+    assert np.isnan(course(reader, "/kpa/arm")).tolist() == [False] * N + [True]
 
 
 def test_rerun_reads_the_file_for_foxglove_too(series: Series, tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_what_was_recorded_after_the_clock_was_set_back_comes_after_the_rest(
     times_ns = [3600 * SECOND + n for n in range(5)] + list(range(5))
     with Recorder(path) as recorder:
         for t_ns in times_ns:
-            recorder.say(TOPIC, t_ns, b"{}")
+            recorder.say(TOPIC, t_ns, b'{"schema":"skin.health/1"}')
             recorder.can("can0", FrameBatch.of([(0x4E0, b"", t_ns)]))
     assert [one.t_ns for one in read_messages_of(path)] == times_ns
     assert [int(batch.t_ns[0]) for _, batch in read_can(path)] == times_ns
@@ -147,7 +147,8 @@ def test_an_interrupted_recording_gives_what_it_holds_and_then_its_damage(tmp_pa
     path = tmp_path / "a.mcap"
     recorder = Recorder(path)
     for n in range(20_000):
-        recorder.say(TOPIC, n, b'{"state":"ok","more":"' + str(n).encode() * 30 + b'"}')
+        more = str(n).encode() * 30
+        recorder.say(TOPIC, n, b'{"schema":"skin.health/1","more":"' + more + b'"}')
     whole = recorder._draft.path
     cut = tmp_path / "cut.mcap"
     recorder.close()
@@ -164,7 +165,7 @@ def test_two_recordings_one_after_the_other_are_not_the_first_alone(tmp_path: Pa
     """As by `cat`: the second one was left out without a word."""
     for name in ("a", "b"):
         with Recorder(tmp_path / f"{name}.mcap") as recorder:
-            recorder.say(TOPIC, SECOND, b'{"state":"ok"}')
+            recorder.say(TOPIC, SECOND, b'{"schema":"skin.health/1"}')
     joined = tmp_path / "joined.mcap"
     joined.write_bytes(b"".join((tmp_path / f"{name}.mcap").read_bytes() for name in "ab"))
     with pytest.raises(LogError, match=r"goes on after its end.*`mcap merge`"):

@@ -86,6 +86,39 @@ def test_a_node_that_is_killed_leaves_no_contact(tmp_path: Path, ahead_s: float)
     assert states(series) == [("ON", 0.0), ("UNKNOWN", 2.5)]
 
 
+@pytest.mark.parametrize("status", [b"offline", b"online"])
+def test_what_the_broker_had_stored_of_a_robot_that_is_off_is_not_known(
+    tmp_path: Path, status: bytes
+) -> None:
+    """In the order in which they come; `online` stays after a power cut of broker and robot."""
+    _, layout = load_skin(CONFIG)
+    info = encode_info(node_info(layout, "main", version="1", configuration="x"))
+    ok = b'{"schema": "skin.health/1", "state": "ok"}'
+    said = {
+        f"{TOPIC}/contact": b"OFF",
+        f"{TOPIC}/health": ok,
+        f"{NODE}/status": status,
+        f"{NODE}/info": info,
+    }
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for topic, payload in said.items():
+            recorder.say(topic, START_NS, payload, stored=True)
+        recorder.say("skin/icub/other/health", START_NS + 10 * S, ok)
+        assert not recorder.unreadable
+    series = read_messages(tmp_path / "a.mcap")
+    assert [one.state for one in series.contacts] == ["UNKNOWN"]
+    assert [one.part for one in series.health] == ["other"]
+
+
+def test_what_the_broker_had_stored_is_known_as_soon_as_its_part_lives(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.say(f"{TOPIC}/contact", START_NS, b"ON", stored=True)
+        for at_s in (1, 2, 3):
+            frame = encode_frame(make_frame([5.0] * M, part=PART, t_ns=START_NS + at_s * S))
+            recorder.say(f"{TOPIC}/frame", START_NS + at_s * S, frame)
+    assert states(read_messages(tmp_path / "a.mcap")) == [("ON", 1.0)]
+
+
 def test_a_node_that_starts_again_begins_without_the_contacts_before(tmp_path: Path) -> None:
     def end(recorder: Recorder, live: Live) -> None:
         for at_s, payload in ((2.5, b"offline"), (9.0, b"online")):

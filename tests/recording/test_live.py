@@ -4,13 +4,14 @@ import asyncio
 import json
 import os
 import signal
+import socket
 import sys
 import warnings
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -20,11 +21,12 @@ from websockets.typing import Subprotocol
 
 from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
-from skin_host.mqtt.info import PartInfo, node_info
+from skin_host.mqtt.info import FingertipInfo, PartInfo, node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.frame import PressureFrame
 from skin_host.recording.export import live
 from skin_host.recording.export.scene import Arrows, EventLine, Points
+from skin_host.recording.export.series import HealthLine
 from tests.support.broker import Mosquitto, free_port
 from tests.support.rerun import chunks
 from tests.support.said import touch_event
@@ -132,9 +134,11 @@ async def following(broker: Mosquitto) -> AsyncIterator[list[Any]]:
     running = asyncio.create_task(live.run(where, "demo", stop, serving(), lambda _: ready.set()))
     async with asyncio.timeout(PATIENCE_S):
         await ready.wait()
-        yield items
-        stop.set()
-        await running
+        try:
+            yield items
+        finally:
+            stop.set()
+            await running
 
 
 async def test_a_part_of_a_robot_that_is_gone_does_not_look_as_it_was(
@@ -170,6 +174,84 @@ async def test_a_part_of_a_robot_that_is_gone_does_not_look_as_it_was(
             await stack.aclose()
             await until(lambda: not last(Points).points["valid"].any())
             assert last(Points).t_ns > before_ns
+
+
+async def test_what_touched_a_robot_that_is_gone_is_not_known_any_more(
+    mosquitto: Mosquitto,
+) -> None:
+    """Fingertips are no other: they have no taxels that would show it."""
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    info = node_info(layout, "main", version="1", configuration="x")
+    tip = FingertipInfo(3, "sphere", [7.0], None, None, 0.3, 8.0)
+    touched = {"left_hand", "tip"}
+
+    def shown() -> dict[str, tuple[bool, bool]]:
+        arrows = {item.part: item for item in items if isinstance(item, Arrows)}
+        return {part: (bool(item.arrows), item.is_known) for part, item in arrows.items()}
+
+    settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    async with AsyncExitStack() as stack:
+        robot = await stack.enter_async_context(Publisher(settings, "demo", "main"))
+        robot.put_info(msgspec.structs.replace(info, fingertips={"tip": tip}))
+        async with following(mosquitto) as items:
+            while shown() != dict.fromkeys(touched, (True, True)):
+                for part in touched:
+                    robot.put_contact(part, "ON")
+                    robot.put_touch(msgspec.structs.replace(TOUCH, part=part))
+                await asyncio.sleep(0.05)
+            await stack.aclose()
+            await until(lambda: shown() == dict.fromkeys(touched, (False, False)))
+
+
+async def test_what_has_no_time_follows_the_rest_by_the_clock_of_the_robot(
+    mosquitto: Mosquitto,
+) -> None:
+    """By another clock a state would be behind, or hide, the contacts that follow it."""
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+
+    def arrows() -> list[Arrows]:
+        return [item for item in items if isinstance(item, Arrows)]
+
+    async with Publisher(settings, "demo", "main") as robot:
+        robot.put_info(node_info(layout, "main", version="1", configuration="x"))
+        async with following(mosquitto) as items:
+            while not arrows():
+                robot.put_touch(TOUCH)
+                await asyncio.sleep(0.05)
+            robot.put_contact("left_hand", "OFF")
+            await until(lambda: not arrows()[-1].arrows)
+            last_ns = TOUCH.t_ns + 10**12
+            robot.put_touch(msgspec.structs.replace(TOUCH, t_ns=last_ns))
+            await until(lambda: arrows()[-1].arrows)
+            times_ns = [item.t_ns for item in arrows()]
+            assert times_ns == sorted(times_ns)
+            assert times_ns[-1] == last_ns
+
+
+async def test_health_that_the_broker_had_stored_is_not_shown_as_that_of_now(
+    mosquitto: Mosquitto,
+) -> None:
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    async with Publisher(settings, "demo", "main") as robot:
+        robot.put_info(node_info(layout, "main", version="1", configuration="x"))
+        robot.put_health("left_hand", {"state": "silent"})
+        async with following(mosquitto) as items:
+            while not any(isinstance(item, EventLine) for item in items):
+                robot.put_touch(TOUCH.ended(4, 10**18 + 6, "lost"))
+                await asyncio.sleep(0.05)
+            robot.put_health("left_hand", {"state": "ok"})
+            await until(lambda: any(isinstance(item, HealthLine) for item in items))
+            assert [item.state for item in items if isinstance(item, HealthLine)] == ["ok"]
+
+
+async def test_it_ends_when_it_is_asked_to_while_the_broker_does_not_answer() -> None:
+    stop, unused = asyncio.Event(), cast(Any, None)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        stop.set()  # as Ctrl-C does
+        where = f"mqtt://127.0.0.1:{server.getsockname()[1]}"
+        await live.run(where, "demo", stop, unused, unused)
 
 
 async def test_a_forged_last_time_of_all_ends_no_view(mosquitto: Mosquitto) -> None:

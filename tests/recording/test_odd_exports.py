@@ -17,6 +17,7 @@ from skin_host.layout import build_layout
 from skin_host.mqtt.frames import encode_frame
 from skin_host.mqtt.info import encode_info, node_info
 from skin_host.mqtt.messages import encode_event, encode_health
+from skin_host.mqtt.outbox import REPEATED
 from skin_host.processing.frame import PressureFrame
 from skin_host.recording.export import read_messages
 from skin_host.recording.export.columns import TABLES
@@ -252,6 +253,21 @@ def test_an_event_that_came_twice_is_exported_once(tmp_path: Path) -> None:
     path = recording(tmp_path, [("skin/demo/palm/touch", payload) for payload in payloads])
     seen = [(event.count, event.t_ns // 10**17) for event in read_messages(path).touches]
     assert seen == [(1, 17), (2, 18), (1, 16), (0, 17), (0, 17)]
+
+
+def test_all_that_a_node_sends_again_over_its_next_connection_is_exported_once(
+    tmp_path: Path,
+) -> None:
+    """To the next of several brokers, what it has sent in the last 10 s."""
+    place, normal = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+    payloads = []
+    for count in range(1, REPEATED + 1):
+        t_ns = START_NS + count * PERIOD_NS
+        event = touch_event("move", 7, count, t_ns, "palm", [1], place, normal, 40.0, 3.0, 2.0, 0.1)
+        payloads.append(encode_event(event, count))
+    path = recording(tmp_path, [("skin/demo/palm/touch", payload) for payload in 2 * payloads])
+    touches = read_messages(path).touches
+    assert [event.count for event in touches] == list(range(1, REPEATED + 1))
 
 
 @pytest.mark.parametrize("kind", ["frame", "touch"])

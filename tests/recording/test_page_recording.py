@@ -36,7 +36,9 @@ async def test_a_recording_that_filled_the_disk_names_what_there_is_of_it(
     async with connect(broker, identifier="health") as connection:
         for n in range(100):
             # So that it is there whenever the recording begins to listen.
-            health = msgspec.json.encode({"state": os.urandom(30_000).hex()})
+            health = msgspec.json.encode(
+                {"schema": "skin.health/1", "state": os.urandom(30_000).hex()}
+            )
             await connection.publish(f"skin/demo/p{n}/health", health, qos=1, retain=True)
         await until(lambda: recording.state is not None and "ended" in recording.state)
     assert recording.state is not None

@@ -4,6 +4,7 @@ import asyncio
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections import Counter
@@ -15,13 +16,14 @@ from mcap.reader import make_reader
 
 from skin_host.cli import main
 from skin_host.config.settings import Mqtt, load
-from skin_host.layout import build_layout
+from skin_host.layout import build_layout, load_skin
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import FIRST_RETRY_S, GOOD_S, Retry, connect
-from skin_host.mqtt.info import node_info
+from skin_host.mqtt.info import encode_info, node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.recording import capture
 from skin_host.recording.capture import capture_broker
+from skin_host.recording.export import read_messages
 from skin_host.recording.mcap import Recorder, read_messages_of, recorded_topics
 from tests.support.broker import Mosquitto
 from tests.support.candump import write_config, write_log
@@ -212,6 +214,67 @@ async def test_a_robot_is_recorded_until_ctrl_c_and_played_again(
     assert played == 0
 
 
+async def test_a_recording_ends_when_it_is_asked_to_while_the_broker_does_not_answer(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "a.mcap"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        where = f"mqtt://127.0.0.1:{server.getsockname()[1]}"
+        command = [sys.executable, "-m", "skin_host", "record", str(file), "--broker", where]
+        recording = await asyncio.create_subprocess_exec(
+            *command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        assert recording.stderr is not None
+        assert b"recording" in await asyncio.wait_for(recording.stderr.readline(), PATIENCE_S)
+        recording.send_signal(signal.SIGINT)
+        _, err = await asyncio.wait_for(recording.communicate(), PATIENCE_S)
+    assert recording.returncode == 1
+    assert b"nothing is recorded; it ended before any robot answered" in err
+    assert not file.exists()
+
+
+async def test_a_robot_that_is_off_is_not_untouched_in_a_recording(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    broker, robot = Broker(mosquitto.host, mosquitto.port), "skin/icub"
+    info = encode_info(node_info(load_skin(CONFIG)[1], "main", version="1", configuration="x"))
+    async with connect(broker, identifier="robot") as connection:
+        for topic, payload in {
+            "left_hand/contact": b"OFF",
+            "left_hand/health": b'{"schema": "skin.health/1", "state": "ok"}',
+            "nodes/main/status": b"offline",
+            "nodes/main/info": info,
+        }.items():
+            await connection.publish(f"{robot}/{topic}", payload, qos=1, retain=True)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        stop = asyncio.Event()
+        recording = asyncio.create_task(capture_broker(recorder, broker, "skin", "icub", stop))
+        await until(lambda: len(recorder.messages) == 4)
+        stop.set()
+        await recording
+    series = read_messages(tmp_path / "a.mcap")
+    assert [(one.part, one.state) for one in series.contacts] == [("left_hand", "UNKNOWN")]
+    assert series.health == []
+
+
+def test_what_no_export_could_read_is_not_recorded(tmp_path: Path) -> None:
+    """One such message would cost the whole recording; one that was deleted holds nothing."""
+    health, info = "skin/demo/palm/health", "skin/demo/nodes/main/info"
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.say("skin/demo/palm/contact", 1, b"ON")
+        for topic, payload in (
+            (health, b"{}"),
+            (health, b'{"schema": "skin.health/1", "sentences": 3}'),
+            (info, b"{}"),
+        ):
+            recorder.say(topic, 1, payload)
+        assert recorder.unreadable == 3
+        for topic in (health, info):
+            recorder.say(topic, 1, b"")
+        assert recorder.unreadable == 3
+    assert main(["export", str(tmp_path / "a.mcap"), str(tmp_path / "tables")]) == 0
+
+
 async def test_messages_that_came_faster_than_they_were_recorded_are_counted(
     mosquitto: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -227,7 +290,8 @@ async def test_messages_that_came_faster_than_they_were_recorded_are_counted(
             last = recorded_topics("skin", "icub")[-1]
             await until(lambda: mosquitto.subscriptions(last))
             # It follows all that was retained.
-            await connection.publish("skin/icub/last/health", b"{}", qos=1)
+            health = b'{"schema": "skin.health/1"}'
+            await connection.publish("skin/icub/last/health", health, qos=1)
             await until(lambda: "health" in recorder.messages)
             stop.set()
             await recording

@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError
 from skin_host.mqtt.frames import encode_frame
+from skin_host.mqtt.info import NodeInfo, encode_info
 from skin_host.mqtt.messages import encode_event
 from skin_host.processing.frame import PressureFrame
 from skin_host.recording.mcap import Recorder, read_can, read_messages_of
@@ -38,9 +39,10 @@ def touch(event: Any, number: int) -> bytes:
 
 
 def everything() -> list[tuple[str, bytes]]:
+    info = NodeInfo(robot="demo", node="main", version="1", configuration="x", parts={})
     return [
         ("skin/demo/nodes/main/status", b"online"),
-        ("skin/demo/nodes/main/info", b'{"schema":"skin.info/1","parts":{}}'),
+        ("skin/demo/nodes/main/info", encode_info(info)),
         (f"{TOPIC}/frame", frame(1)),
         (f"{TOPIC}/frame", frame(2, raw=True)),
         (f"{TOPIC}/touch", touch("begin", 1)),

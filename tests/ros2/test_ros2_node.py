@@ -20,7 +20,7 @@ from skin_host.client import Contact, Described, Frame, Health, PartInfo
 from skin_host.errors import BrokerError
 from skin_host.mqtt.topics import MAX_PART, wrong_part
 from skin_host.processing.events import Touch
-from tests.support.ros import check_topic
+from tests.support.ros import ExternalShutdownException, check_topic
 from tests.support.said import touch_event
 
 PACKAGE = Path(__file__).parents[2] / "ros2" / "skin_host_ros"
@@ -32,10 +32,14 @@ MODULES = [
 
 
 class Node:
-    """Keeps what is published: (topic, message)."""
+    """Keeps what is published: (topic, message), and what is logged."""
 
     def __init__(self, name: str) -> None:
         self.published: list[tuple[str, Any]] = []
+        self.logged: list[str] = []
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(error=self.logged.append)
 
     def declare_parameter(self, name: str, default: str) -> Any:
         return SimpleNamespace(value=default)
@@ -57,6 +61,7 @@ def module(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     for name in MODULES:
         monkeypatch.setitem(sys.modules, name, MagicMock())
     sys.modules["rclpy.node"].Node = Node  # type: ignore[attr-defined]
+    sys.modules["rclpy.executors"].ExternalShutdownException = ExternalShutdownException  # type: ignore[attr-defined]
     monkeypatch.syspath_prepend(PACKAGE)
     node = importlib.import_module("skin_host_ros.node")
     monkeypatch.setattr(node, "message_class", lambda _: SimpleNamespace)
@@ -247,6 +252,33 @@ def test_without_a_broker_or_robot_it_ends_with_one_line(
     with pytest.raises(SystemExit, match="skin: no node published its info"):
         module.main()
     sys.modules["rclpy"].try_shutdown.assert_called_once()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, ExternalShutdownException])
+def test_it_ends_quietly_with_ctrl_c_and_when_ros_shuts_down(
+    module: ModuleType, monkeypatch: pytest.MonkeyPatch, end: type[BaseException]
+) -> None:
+    """Its client has ended then, too."""
+    skin, executor = MagicMock(), MagicMock()
+    skin.return_value.__exit__.return_value = None
+    skin.return_value.parts.return_value = {}
+    executor.return_value.spin.side_effect = end
+    monkeypatch.setattr(module, "SkinCallbacks", skin)
+    monkeypatch.setattr(module, "MultiThreadedExecutor", executor)
+    module.main()
+    skin.return_value.__exit__.assert_called_once()
+    sys.modules["rclpy"].try_shutdown.assert_called_once()  # type: ignore[attr-defined]
+
+
+def test_a_later_part_of_a_name_that_is_taken_is_named_once(node: Any) -> None:
+    """Its frames come for hours, fifty a second."""
+    node._on_info(Described("left-hand", "main", shape(0.0)))
+    for seq in range(3):
+        node._on_frame(frame("left_hand", seq))
+        node._on_contact(Contact("left_hand", "OFF"))
+    assert {message.header.frame_id for _, message in node.published} == {"left-hand"}
+    both = "the parts left-hand and left_hand would both be left_hand in ROS; rename one of them"
+    assert node.logged == [both]
 
 
 def test_it_is_started_again() -> None:

@@ -69,6 +69,10 @@ class Page:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
+    async def click_on(self, element: str) -> None:
+        """Click an element, an expression in the page, as soon as a person could."""
+        await self.until(f"(one => one && !one.disabled && (one.click(), true))({element})")
+
     async def until(self, script: str) -> Any:
         """Wait until an expression in the page is true, and return its value."""
         try:

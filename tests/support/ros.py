@@ -60,6 +60,10 @@ class Node:
         return SimpleNamespace(publish=publish)
 
 
+class ExternalShutdownException(Exception):  # noqa: N818  # rclpy names it
+    """What rclpy raises where something else has shut it down, as its handler of SIGTERM does."""
+
+
 nodes: list[Node] = []
 
 
@@ -78,6 +82,7 @@ def install(monkeypatch: pytest.MonkeyPatch, enough: int) -> None:
     nodes.clear()
     for name, attributes in {
         "rclpy": {"init": lambda: None, "create_node": create_node, "spin": spin},
+        "rclpy.executors": {"ExternalShutdownException": ExternalShutdownException},
         "geometry_msgs": {},
         "geometry_msgs.msg": {"WrenchStamped": WrenchStamped},
         "std_msgs": {},

@@ -79,6 +79,17 @@ def picture(parts: dict[str, int] | None = None) -> Picture:
     return made
 
 
+def test_a_page_expects_frames_as_often_as_they_are_published() -> None:
+    """Between two of them their part would look stale."""
+    found = {}
+    for frame_hz in (0.0, 100.0, 0.5):
+        made = Picture()
+        take_nodes(made, {"main": (True, replace(info({"palm": 3}), frame_hz=frame_hz))})
+        layout = msgspec.json.decode(made.news(Cursor(), NOW_S)[0])
+        found[frame_hz] = layout["parts"][0]["period_ms"]
+    assert found == {0.0: 50, 100.0: 50, 0.5: 2000}
+
+
 def texts(news: list[bytes | str]) -> dict[str, Any]:
     return {
         message["type"]: message

@@ -16,7 +16,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
-from rclpy.executors import MultiThreadedExecutor
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2
@@ -65,6 +65,8 @@ class SkinNode(Node):
         self._messages = Messages(message_class, message_array, lambda level: bytes([level]))
         #: By name in topics: the part that has it.
         self._named: dict[str, str] = {}
+        #: Parts whose names others have.
+        self._nameless: set[str] = set()
         self._shapes: dict[str, PartInfo] = {}
         #: By part: the newest time that came of it, by the robot's clock.
         self._newest_ns: dict[str, int] = {}
@@ -80,7 +82,16 @@ class SkinNode(Node):
         return self.create_publisher(kind, topic, qos)
 
     def _publish(self, part: str, what: str, kind: type, qos: QoSProfile, message: Any) -> None:
-        self._publisher(kind, f"{self._name(part)}/{what}", qos).publish(message)
+        """Publish a message of a part, unless another part has its name; that is logged once."""
+        try:
+            name = self._name(part)
+        except RequestError as error:
+            if part not in self._nameless:
+                self._nameless.add(part)
+                self.get_logger().error(str(error))
+            return
+        self._nameless.discard(part)
+        self._publisher(kind, f"{name}/{what}", qos).publish(message)
 
     def _name(self, part: str) -> str:
         """Return a part's name in topics.
@@ -198,5 +209,7 @@ def main() -> None:
             node.destroy_node()
     except SkinError as error:
         sys.exit(f"skin: {error}")
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
     finally:
         rclpy.try_shutdown()

@@ -64,11 +64,12 @@ class Known:
     def info(self, node: str, parts: list[str], t_ns: int) -> None:
         """Take which parts a node has."""
         self._presence.take_info(node, parts, t_ns * 1e-9)
+        self._look(t_ns)
 
-    def state(self, part: str, state: ContactState, t_ns: int) -> None:
-        """Take the contact state of a part."""
+    def state(self, part: str, state: ContactState, t_ns: int, stored: bool) -> None:
+        """Take the contact state of a part; one that the broker had stored may be from any time."""
         self._look_if_late(t_ns)
-        self._presence.take_state(part, state, t_ns * 1e-9)
+        self._presence.take_state(part, state, t_ns * 1e-9, stored=stored)
         self._look(t_ns)
 
     def touch(self, touch: Touch, t_ns: int) -> None:
@@ -84,7 +85,8 @@ class Known:
         if sent_ns is not None:
             self._sent_ns[part] = sent_ns, t_ns
         self._presence.take_sign(part, t_ns * 1e-9)
-        self._look_if_late(t_ns)
+        if self._parts.get(part) is False:  # it may be known again
+            self._look(t_ns)
 
     def _look_if_late(self, t_ns: int) -> None:
         if abs(t_ns - self._looked_ns) >= LOOK_NS:

@@ -61,13 +61,17 @@ async def run(
     Raises:
         SkinError: no broker, no robot, a port that is taken, or a package that is not installed.
     """
-    async with SkinClient(broker, robot=robot) as skin:
-        await skin.info()
-        async with serving as (url, begin):
-            view = _View(begin, clock)
-            view.lay_out(skin.parts(), [])
-            show_url(url)
-            await until(stop, _follow(skin, view, clock))
+
+    async def show() -> None:
+        async with SkinClient(broker, robot=robot) as skin:
+            await skin.info()
+            async with serving as (url, begin):
+                view = _View(begin, clock)
+                view.lay_out(skin.parts(), [])
+                show_url(url)
+                await _follow(skin, view, clock)
+
+    await until(stop, show())
 
 
 class _View:
@@ -83,7 +87,8 @@ class _View:
         self._begin = begin
         self._clock = clock
         self._infos: dict[str, PartInfo | FingertipInfo] | None = None
-        self._last_ns: dict[str, int] = {}
+        #: By part: the time in its last message that has one, and when that came by our clock.
+        self._last: dict[str, tuple[int, int]] = {}
         self.shapes: dict[str, PartInfo] = {}
 
     def lay_out(self, parts: Mapping[str, Described], touches: Iterable[Touch]) -> None:
@@ -93,7 +98,6 @@ class _View:
             return
         for name in (self._infos or {}).keys() - infos.keys():
             self.show_unknown(name)
-            self.show_untouched(name)
         self._infos = infos
         self.shapes = {name: one for name, one in infos.items() if isinstance(one, PartInfo)}
         tips = {name: one for name, one in infos.items() if isinstance(one, FingertipInfo)}
@@ -106,26 +110,41 @@ class _View:
         """Show the pressures of a part that is described as the frame has it."""
         shape = self.shapes.get(frame.part)
         if shape is not None and len(frame.valid) == len(shape.pads):
-            self._last_ns[frame.part] = frame.t_ns
+            self._note_time(frame)
             kpa = np.where(frame.valid, frame.pressure_kpa, np.nan)
             self.show(self.scene.points(frame.part, frame.t_ns, kpa, frame.beyond_range))
 
     def show_touch(self, touch: Touch) -> None:
         if touch.part in self.scene.origins_m:
+            self._note_time(touch)
             self.show(self.scene.arrows(touch.part, touch.t_ns, [touch]))
 
     def show_untouched(self, part: str) -> None:
-        if part in self.scene.origins_m:
-            self.show(self.scene.untouched(part, self._now_ns(part)))
+        now_ns = self._now_ns(part)
+        if now_ns is not None and part in self.scene.origins_m:
+            self.show(self.scene.untouched(part, now_ns))
 
     def show_unknown(self, part: str) -> None:
         """Show that nothing is known of a part: it must not go on looking as it was last."""
+        now_ns = self._now_ns(part)
+        if now_ns is None:
+            return
         if part in self.shapes:
-            self.show(self.scene.unknown(part, self._now_ns(part)))
+            self.show(self.scene.unknown(part, now_ns))
+        if part in self.scene.origins_m:
+            self.show(self.scene.untouched(part, now_ns, is_known=False))
 
-    def _now_ns(self, part: str) -> int:
-        """Return the time of what follows the last frame of a part."""
-        return max(self._clock.now_ns(), min(self._last_ns.get(part, 0) + 1, LATEST_NS))
+    def _note_time(self, item: Frame | Touch) -> None:
+        self._last[item.part] = item.t_ns, self._clock.monotonic_ns()
+
+    def _now_ns(self, part: str) -> int | None:
+        """Return the time by the robot's clock, as far as a part shows it; None: nothing was shown
+        of it.
+        """
+        if part not in self._last:
+            return None
+        t_ns, came_ns = self._last[part]
+        return min(t_ns + max(1, self._clock.monotonic_ns() - came_ns), LATEST_NS)
 
 
 async def _follow(skin: SkinClient, view: _View, clock: Clock) -> None:
@@ -157,6 +176,8 @@ async def _follow(skin: SkinClient, view: _View, clock: Clock) -> None:
     async def health() -> None:
         latest: dict[str, str] = {}
         async for said in skin.health():
+            if said.stored:
+                continue  # it may be from any time, and shows nothing of now
             line = health_line(said.part, clock.now_ns(), said.record)
             if latest.get(said.part) != line.text:
                 latest[said.part] = line.text

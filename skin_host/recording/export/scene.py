@@ -22,7 +22,7 @@ from skin_host.errors import RequestError, required
 from skin_host.files import whole_file, write_atomic, writing
 from skin_host.fingertip.events import FingertipEvent, Over, Slip
 from skin_host.mqtt.info import FingertipInfo, PartInfo
-from skin_host.processing.events import Touch
+from skin_host.processing.events import Reason, Touch
 from skin_host.recording import is_mcap
 from skin_host.recording.export.series import HealthLine, Series
 from skin_host.recording.mcap import read_records
@@ -63,11 +63,19 @@ Floats = NDArray[np.floating[Any]]
 
 
 class Arrow(NamedTuple):
-    """A contact at an instant: its place, and its force (N) into the skin."""
+    """A contact at an instant: its place, its force (N) into the skin, and whether that is a bound
+    from below.
+    """
 
     id: int
     at_m: tuple[float, float, float]
     force_n: tuple[float, float, float]
+    is_bound: bool
+
+    @property
+    def label(self) -> str:
+        bound = "≥ " if self.is_bound else ""
+        return f"#{self.id} {bound}{float(np.linalg.norm(self.force_n)):.2f} N"
 
 
 class Points(NamedTuple):
@@ -79,11 +87,14 @@ class Points(NamedTuple):
 
 
 class Arrows(NamedTuple):
-    """The contacts of a part from an instant on."""
+    """The contacts of a part from an instant on, and whether anything is known of them: without
+    arrows nothing touches the part only then.
+    """
 
     part: str
     t_ns: int
     arrows: list[Arrow]
+    is_known: bool = True
 
 
 class EventLine(NamedTuple):
@@ -163,17 +174,21 @@ class SkinScene:
     def arrows(self, part: str, t_ns: int, touches: Iterable[Touch]) -> Arrows:
         """The contacts of a part after some of its events."""
         there = self._arrows[part]
+        reason: Reason | None = None
         for touch in touches:
             there.pop(touch.id, None)
             arrow = _arrow(touch)
             if arrow is not None:
                 there[touch.id] = arrow
-        return Arrows(part, t_ns, list(there.values()))
+            reason = touch.reason
+        return Arrows(part, t_ns, list(there.values()), bool(there) or reason == "released")
 
-    def untouched(self, part: str, t_ns: int) -> Arrows:
-        """Nothing touches a part, whatever has been received of its contacts."""
+    def untouched(self, part: str, t_ns: int, *, is_known: bool = True) -> Arrows:
+        """Nothing touches a part, or nothing is known of that, whatever has been received of its
+        contacts.
+        """
         self._arrows[part].clear()
-        return Arrows(part, t_ns, [])
+        return Arrows(part, t_ns, [], is_known)
 
 
 class RecordedScene:
@@ -239,20 +254,20 @@ class RecordedScene:
         gone_ns = self._series.gone_ns(name)
         for t_ns, touches in groupby(mine, key=lambda touch: touch.t_ns):
             while gone_ns and gone_ns[0] <= t_ns:
-                yield self.scene.untouched(name, gone_ns.pop(0))
+                yield self.scene.untouched(name, gone_ns.pop(0), is_known=False)
             yield self.scene.arrows(name, t_ns, touches)
         for last_ns in gone_ns:
-            yield self.scene.untouched(name, last_ns)
+            yield self.scene.untouched(name, last_ns, is_known=False)
 
 
 def _arrow(touch: Touch) -> Arrow | None:
     if touch.event == "end" or touch.centroid_m is None:
         return None
-    if touch.load is not None:
-        return Arrow(touch.id, touch.centroid_m, touch.load.force_n)
-    x, y, z = touch.normal or (0.0, 0.0, 1.0)
-    force_n = (-x * touch.force_n, -y * touch.force_n, -z * touch.force_n)
-    return Arrow(touch.id, touch.centroid_m, force_n)
+    force_n = touch.load.force_n if touch.load is not None else None
+    if force_n is None:
+        x, y, z = touch.normal or (0.0, 0.0, 1.0)
+        force_n = (-x * touch.force_n, -y * touch.force_n, -z * touch.force_n)
+    return Arrow(touch.id, touch.centroid_m, force_n, touch.force_is_bound)
 
 
 def event_line(event: FingertipEvent) -> EventLine | None:
@@ -338,6 +353,7 @@ def _copy(recording: Path, writer: Any) -> None:
                 topic=channel.topic,
                 message_encoding=channel.message_encoding,
                 schema_id=0 if schema is None else schemas[schema.id],
+                metadata=channel.metadata,
             )
         writer.add_message(
             channel_id=channels[channel.id],
@@ -382,7 +398,7 @@ def foxglove_message(item: Item) -> tuple[str, int, Any]:
     match item:
         case Points(part, t_ns, _):
             return f"/{part}/points", t_ns, _cloud(item)
-        case Arrows(part, t_ns, _):
+        case Arrows(part, t_ns, _, _):
             return f"/{part}/contacts", t_ns, _update(item)
         case EventLine(_, t_ns, _):
             return "/events", t_ns, _log(item, is_warning=True)
@@ -443,7 +459,7 @@ def _update(item: Arrows) -> Any:
         shown.head_diameter = 2 * SHAFT_M
         _paint(shown.color)
         words = entity.texts.add()
-        words.text = f"#{arrow.id} {size_n:.2f} N"
+        words.text = arrow.label
         place = words.pose.position
         place.x, place.y, place.z = start_m.tolist()
         words.pose.orientation.w = 1.0
@@ -500,7 +516,10 @@ def write_rerun(series: Series, output: Path) -> None:
 
 
 class RerunStream:
-    """Logs items to a recording stream of Rerun, which goes to a file or to a viewer."""
+    """Logs items to a recording stream of Rerun, which goes to a file or to a viewer.
+
+    What is not known is NaN in its courses over time: 0 would be untouched.
+    """
 
     def __init__(self, stream: Any, scene: SkinScene) -> None:
         self._rr = rr = required("rerun", "views in Rerun", "rerun")
@@ -521,18 +540,19 @@ class RerunStream:
                 radius_m = self._scene.radius_m[part]
                 cloud = rr.Points3D(places_m, colors=colours, radii=radius_m)
                 stream.log(f"{where}/taxels", cloud)
-                stream.log(f"kpa/{part}", rr.Scalars(float(points["kpa"].max(initial=0.0))))
-            case Arrows(part, _, arrows):
+                kpa = points["kpa"][points["valid"] > 0]
+                stream.log(f"kpa/{part}", rr.Scalars(float(kpa.max()) if len(kpa) else np.nan))
+            case Arrows(part, _, arrows, is_known):
                 forces_n = np.array([one.force_n for one in arrows]).reshape(-1, 3)
                 starts_m = np.array([one.at_m for one in arrows]).reshape(-1, 3)
                 shown = rr.Arrows3D(
                     origins=starts_m - forces_n * ARROW_M_PER_N,
                     vectors=forces_n * ARROW_M_PER_N,
                     colors=[ARROW_RGBA] * len(arrows),
-                    labels=[f"#{one.id} {np.linalg.norm(one.force_n):.2f} N" for one in arrows],
+                    labels=[one.label for one in arrows],
                 )
                 stream.log(f"{where}/contacts", shown)
-                total_n = float(np.linalg.norm(forces_n, axis=1).sum())
+                total_n = float(np.linalg.norm(forces_n, axis=1).sum()) if is_known else np.nan
                 stream.log(f"force_n/{part}", rr.Scalars(total_n))
             case HealthLine():
                 level = "INFO" if item.state == "ok" else "WARN"

@@ -27,6 +27,7 @@ from skin_host.mqtt.messages import (
     decode_contact,
     decode_health,
 )
+from skin_host.mqtt.outbox import REPEATED
 from skin_host.mqtt.payload import MessageError
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine
@@ -168,7 +169,7 @@ def read_messages(recording: Path) -> Series:
     robots: set[str] = set()
     parts: dict[str, _Growing] = {}
     found = Series({}, [], {})
-    repeats = SentTwice()
+    repeats = SentTwice(2 * REPEATED)  # to the next broker, besides what was in flight
     health: dict[str, HealthLine] = {}
     #: What a client would have received, in its order.
     received: list[Callable[[Known], None]] = []
@@ -200,10 +201,10 @@ def read_messages(recording: Path) -> Series:
                         received.append(methodcaller("touch", event, said.t_ns))
             elif kind == "contact" and said.payload:
                 state = decode_contact(said.payload)
-                received.append(methodcaller("state", name, state, said.t_ns))
+                received.append(methodcaller("state", name, state, said.t_ns, said.stored))
             elif kind == "status":
                 received.append(methodcaller("status", name, said.payload, said.t_ns))
-            elif kind == "health" and said.payload:
+            elif kind == "health" and said.payload and not said.stored:
                 received.append(methodcaller("sign", name, said.t_ns))
                 line = health_line(name, said.t_ns, decode_health(said.payload))
                 if name not in health or health[name]._replace(t_ns=said.t_ns) != line:

@@ -4,7 +4,7 @@ export const LONGEST_S = 600;
 const FINE_SLOTS = FINE_S * 26;
 const COARSE_MS = 500;
 const COARSE_SLOTS = (LONGEST_S * 1000) / COARSE_MS;
-/** Points farther apart than this are not joined: nothing was heard between. */
+/** Points farther apart than this, or two periods of what comes more slowly, are not joined: nothing came between. */
 const GAP_MS = 700;
 
 /** Rows of values with their times, of which only the newest stay. */
@@ -34,8 +34,9 @@ class Ring {
 
 /** The past of some taxels; NaN where there is no value. */
 export class History {
-  constructor(n) {
+  constructor(n, periodMs) {
     this.n = n;
+    this.gapMs = Math.max(GAP_MS, 2 * periodMs);
     this.fine = new Ring(FINE_SLOTS, n);
     this.low = new Ring(COARSE_SLOTS, n);
     this.high = new Ring(COARSE_SLOTS, n);
@@ -76,17 +77,17 @@ export class History {
       points.push([t, value]);
       last = t;
     };
-    const { fine, low, high } = this;
+    const { fine, low, high, gapMs } = this;
     const start = fine.oldest;
     for (let k = 0; k < low.filled && fromMs < start; k++) {
       const slot = low.slot(k);
       if (high.times[slot] >= start) break;
-      put(low.times[slot], low.values[slot * this.n + taxel], GAP_MS + COARSE_MS);
-      put(high.times[slot], high.values[slot * this.n + taxel], GAP_MS + COARSE_MS);
+      put(low.times[slot], low.values[slot * this.n + taxel], gapMs + COARSE_MS);
+      put(high.times[slot], high.values[slot * this.n + taxel], gapMs + COARSE_MS);
     }
     for (let k = 0; k < fine.filled; k++) {
       const slot = fine.slot(k);
-      put(fine.times[slot], fine.values[slot * this.n + taxel], GAP_MS);
+      put(fine.times[slot], fine.values[slot * this.n + taxel], gapMs);
     }
     return points;
   }

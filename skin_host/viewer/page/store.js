@@ -53,7 +53,7 @@ export class Part {
     this.noLoad = this.triangles.length ? Float32Array.from({ length: this.n }, (_, i) => this.triangleOf(i)?.no_load ?? 240) : new Float32Array(this.n);
     this.health = null;
     this.healthMs = null;
-    this.past = new History(this.n);
+    this.past = new History(this.n, this.periodMs);
     this.pastRaw = null;
   }
 
@@ -145,7 +145,7 @@ export class Part {
   remember(nowMs) {
     this.past.add(nowMs, this.pressure.map((value, i) => (this.bits[i] & VALID ? value : NaN)));
     if (!this.raw) return;
-    this.pastRaw ??= new History(this.n);
+    this.pastRaw ??= new History(this.n, this.periodMs);
     this.pastRaw.add(nowMs, Array.from(this.raw, (byte, i) => (this.hasRaw(i) ? byte : NaN)));
   }
 

@@ -195,7 +195,7 @@ MUTANTS = [
     Mutant(
         "single frames' losses are named for any bus",
         "health/diagnosis.py",
-        'if recent["halves"] >= FEW_HALVES:',
+        'if recent["halves"] >= FEW_HALVES and not bus.get("lost_here"):',
         'if recent["frames_hz"] > 0 and recent["halves"] >= 0:',
     ),
     Mutant(

@@ -63,20 +63,32 @@ MANY_PARTS = """(() => {
             { board: "b", number: 0, kind: "x", first: 0, outline_m: square, no_load: 240 },
         ],
     }));
-    const socket = window.sockets.at(-1);
-    const say = message => socket.onmessage({ data: JSON.stringify(message) });
-    say({ type: "layout", version: 9, robot: "many", parts, nodes: {} });
-    for (const part of parts) say({
-        type: "health", part: part.name, state: "not calibrated", taxels: 12, valid_taxels: 0,
+    say("layout", { version: 9, robot: "many", parts, nodes: {} });
+    for (const part of parts) say("health", {
+        part: part.name, state: "not calibrated", taxels: 12, valid_taxels: 0,
         sentences: ["Not calibrated: leave it untouched.", `${part.name} says so`], triangles: [],
     });
     const draws = () => Number(document.body.dataset.draws);
     const before = draws();
-    return new Promise(done => setTimeout(() => done(draws() > before), 600));
+    return new Promise(done => {
+        const look = () => draws() > before ? done(true) : setTimeout(look, 600);
+        setTimeout(look, 600);
+    });
+})()"""
+#: The page takes from a script what it took from its server, of which it takes nothing any more.
+#: The connection may be lost for ever.
+IN_ITS_PLACE = """(() => {
+    const socket = window.sockets.at(-1), take = socket.onmessage;
+    socket.onmessage = socket.send = () => {};
+    window.serve = data => take.call(socket, { data });
+    window.say = (type, message) => serve(JSON.stringify({ type, ...message }));
+    window.lose = () => {
+        window.WebSocket = class { static OPEN = 1; };
+        socket.onclose();
+    };
 })()"""
 #: Parts with one taxel each, and their frames: what a server would send of them.
 PARTS = """(() => {
-    const socket = window.sockets.at(-1);
     const part = (name, more = {}) => ({
         name, node: "main", period_ms: 50, pads: ["pressure"], position_m: [[0, 0, 0]],
         normal: [[0, 0, 1]], radius_mm: [2], area_mm2: [20], triangles: [
@@ -97,7 +109,7 @@ PARTS = """(() => {
         view.setFloat32(32, age_s, true);
         view.setUint8(40, bits);
         raw.forEach((byte, i) => view.setUint8(41 + i, byte));
-        return { data: view.buffer };
+        return view.buffer;
     };
 """
 #: Two of them and a fingertip.
@@ -106,14 +118,13 @@ SERVER = (
     + """
     const bare = { fingertip: true, period_ms: 1000, pads: [], position_m: [], normal: [],
                    radius_mm: [], area_mm2: [], triangles: [] };
-    const say = (type, message) => socket.onmessage({ data: JSON.stringify({ type, ...message }) });
     window.contacts = (part, state, why = null, contacts = []) =>
         say("contacts", { part, state, why, contacts });
     window.health = (part, age_s) => say("health", {
         part, age_s, state: "ok", sentences: [], rate_hz: 50, taxels: 1, valid_taxels: 1,
         triangles: [],
     });
-    window.pressed = (number, age_s) => socket.onmessage(frameOf(9, number, age_s, 1));
+    window.pressed = (number, age_s) => serve(frameOf(9, number, age_s, 1));
     say("layout", { version: 9, robot: "three", nodes: {},
                     parts: [part("palm"), part("wrist"), part("tip", bare)] });
     return true;
@@ -192,7 +203,7 @@ async def test_a_press_is_seen_and_parts_and_values_can_be_chosen(
         await seen.press("Escape")
         await seen.until("""!document.querySelector('#contacts tr[aria-selected="true"]')""")
         # A click chooses a taxel, whose course is drawn from before the click on.
-        await seen.run('document.querySelectorAll("#parts button")[2].click()')
+        await seen.click_on('document.querySelectorAll("#parts button")[2]')
         await seen.press(".")
         await seen.until('!document.getElementById("tip").hidden')
         left, top, width, height = await seen.run(
@@ -322,7 +333,8 @@ async def served(
     """The page, and what a script sends it in a server's place."""
     async with viewing(mosquitto, "nobody", profile, width, watch=WATCH_SOCKETS) as seen:
         await seen.until("window.sockets.at(-1)?.readyState === 1")
-        await seen.run(script)
+        await seen.run(IN_ITS_PLACE)
+        assert await seen.run(script)
         yield seen
 
 
@@ -362,7 +374,7 @@ async def test_nothing_touches_only_what_is_known_to_be_untouched(
         await seen.run("contacts('palm', 'OFF'); contacts('wrist', 'UNKNOWN', 'not_felt')")
         await seen.run(f"contacts('tip', 'ON', null, [{one}])")
         await shows(unknown, "≥ 1.50 N")
-        await seen.run("window.sockets.at(-1).onclose()")
+        await seen.run("lose()")
         await shows("Not known of palm, wrist, tip: there is no connection.", "not known")
         assert await seen.run(CONTACTS) == []
 
@@ -527,25 +539,21 @@ async def test_raw_values_stay_while_any_node_sends_them(
     async with served(mosquitto, tmp_path / "p") as seen:
         await seen.run("""(() => {
             window.asked = [];
-            const socket = window.sockets.at(-1);
-            socket.send = text => asked.push(JSON.parse(text));
-            const take = socket.onmessage;
-            // Of the server itself nothing comes any more.
-            socket.onmessage = () => {};
-            window.say = message => take.call(socket, { data: JSON.stringify(message) });
-            window.answer = (node, ok) => say({ type: "answer", do: "raw", node, ok, error: "no" });
+            window.sockets.at(-1).send = text => asked.push(JSON.parse(text));
+            window.answer = (node, ok) => say("answer", { do: "raw", node, ok, error: "no" });
             const part = (name, node) => ({
                 name, node, period_ms: 50, pads: ["pressure"], position_m: [[0, 0, 0]],
                 normal: [[0, 0, 1]], radius_mm: [2], area_mm2: [20], triangles: [],
             });
-            say({ type: "layout", version: 10, robot: "r", parts: [..."abcd"].map(n => part(n, n)),
-                  nodes: Object.fromEntries([..."abcd"].map(n => [n, { commands: n !== "d" }])) });
-            say({ type: "status", connected: true, commands: true, error: "",
-                  nodes: { a: true, b: false, c: null, d: true } });
+            say("layout", {
+                version: 10, robot: "r", parts: [..."abcd"].map(name => part(name, name)),
+                nodes: Object.fromEntries([..."abcd"].map(n => [n, { commands: n !== "d" }])) });
+            say("status", { connected: true, commands: true, error: "",
+                            nodes: { a: true, b: false, c: null, d: true } });
         })()""")
         await seen.until('!document.getElementById("show-raw").disabled')
         await seen.run('answer("b", false)')  # to what was asked before: nobody waits for it
-        await seen.run('document.getElementById("show-raw").click()')
+        await seen.click_on('document.getElementById("show-raw")')
         await seen.until('document.getElementById("banner").textContent !== "no"')
         wanted = [{"do": "raw", "node": "a"}, {"do": "raw", "node": "c"}]
         assert await seen.run("asked") == wanted
@@ -562,15 +570,11 @@ async def test_raw_values_stay_while_any_node_sends_them(
 RAW_SERVER = (
     PARTS
     + """
-    socket.send = () => {};
-    const take = socket.onmessage;
-    // Of the server itself nothing comes any more.
-    socket.onmessage = () => {};
-    const say = message => take.call(socket, { data: JSON.stringify(message) });
-    say({ type: "layout", version: 10, robot: "r", parts: [part("palm"), part("wrist")],
-          nodes: { main: { commands: true } } });
-    say({ type: "status", connected: true, commands: true, error: "", nodes: { main: true } });
-    window.bytes = (number, byte, bits) => take.call(socket, frameOf(10, number, 0, bits, byte));
+    say("layout", { version: 10, robot: "r", parts: [part("palm"), part("wrist")],
+                    nodes: { main: { commands: true } } });
+    say("status", { connected: true, commands: true, error: "", nodes: { main: true } });
+    window.bytes = (number, byte, bits) => serve(frameOf(10, number, 0, bits, byte));
+    return true;
 })()"""
 )
 
@@ -581,7 +585,7 @@ async def test_a_byte_that_was_not_received_is_no_press(
     """Frames hold 0 for it, which a pad that is pressed to the end of its scale sends, too."""
     async with served(mosquitto, tmp_path / "p", RAW_SERVER) as seen:
         await seen.run("setInterval(() => { bytes(0, 0, 0); bytes(1, 0, 1); }, 50)")
-        await seen.run('document.getElementById("show-raw").click()')
+        await seen.click_on('document.getElementById("show-raw")')
         for key in (".", "Enter", ".", "Enter"):
             await seen.press(key)
         chosen = 'document.getElementById("chosen").innerText'
@@ -602,7 +606,7 @@ async def test_the_words_at_the_scale_of_raw_values_stand_apart(
 ) -> None:
     async with served(mosquitto, tmp_path / "p", RAW_SERVER, width) as seen:
         await seen.run("setInterval(() => { bytes(0, 230, 1); bytes(1, 239, 1); }, 50)")
-        await seen.run('document.getElementById("show-raw").click()')
+        await seen.click_on('document.getElementById("show-raw")')
         await seen.until(f'{TICKS}[0] === "raw = no-load"')
         boxes = await seen.run("""[...document.querySelectorAll("#ticks span")]
             .map(tick => tick.getBoundingClientRect()).map(box => [box.left, box.right])""")
@@ -623,7 +627,7 @@ async def test_what_is_at_the_cursor_stands_beside_it_under_a_banner(
                 - window.labels.find(([text]) => text.startsWith("palm"))[2]"""
         before = await seen.until(below)
         # The connection is lost: the banner stands above the map.
-        await seen.run("window.sockets.at(-1).onclose()")
+        await seen.run("lose()")
         high = await seen.until('document.getElementById("banner").offsetHeight')
         assert high > 30
         # A slow browser draws the map some more times before that has its new place.
@@ -717,16 +721,16 @@ async def test_the_skin_can_be_calibrated_from_the_page(robot: Stack, tmp_path: 
         await seen.until('document.getElementById("confirm").open')
         title = await seen.run('document.getElementById("confirm-title").textContent')
         assert title == "Calibrate left_hand?"
-        await seen.run('document.querySelector("#confirm button.do").click()')
+        await seen.click_on('document.querySelector("#confirm button.do")')
         done = "/^Calibrated. left_hand: [^;]*$|^Touched .* [0-9]+ taxels? of left_hand[.]/"
         await seen.until(f'{done}.test(document.getElementById("banner").textContent)')
         # And the whole skin.
         await seen.press("0")
-        await seen.run('document.getElementById("calibrate").click()')
+        await seen.click_on('document.getElementById("calibrate")')
         await seen.until('document.getElementById("confirm").open')
         title = await seen.run('document.getElementById("confirm-title").textContent')
         assert title == "Calibrate the whole skin?"
-        await seen.run('document.querySelector("#confirm button.do").click()')
+        await seen.click_on('document.querySelector("#confirm button.do")')
         # The scene presses on meanwhile, which is told.
         done = "/^Calibrated. .*left_forearm|^Touched while it was calibrated: /"
         await seen.until(f'{done}.test(document.getElementById("banner").textContent)')
@@ -878,9 +882,7 @@ async def test_a_phone_shows_everything_without_scrolling_sideways(
 async def test_a_name_that_is_wider_than_the_map_makes_no_skin_small(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
-    async with viewing(mosquitto, "nobody", tmp_path / "p", 400, watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.length > 0")
-        assert await seen.run(MANY_PARTS)
+    async with served(mosquitto, tmp_path / "p", MANY_PARTS, 400) as seen:
         drawn = await seen.run(DRAWN)
         name = "`right_upper_part_${k}`"
         assert await seen.run(MANY_PARTS.replace(name, f"k ? {name} : 'w'.repeat(64)"))
@@ -891,15 +893,13 @@ async def test_a_name_that_is_wider_than_the_map_makes_no_skin_small(
 async def test_a_whole_robot_is_one_line_that_opens_and_its_labels_keep_apart(
     mosquitto: Mosquitto, tmp_path: Path, width: int
 ) -> None:
-    async with viewing(mosquitto, "nobody", tmp_path / "p", width, watch=WATCH_SOCKETS) as seen:
-        await seen.until("window.sockets.length > 0")
-        assert await seen.run(MANY_PARTS)
+    async with served(mosquitto, tmp_path / "p", MANY_PARTS, width) as seen:
         text = await seen.run('document.getElementById("health").innerText')
         assert text.startswith("13 parts: not calibrated")
         assert "right_upper_part_3 says so" not in text
         said = await seen.run('document.getElementById("shared").innerText')
         assert said == "Not calibrated: leave it untouched. (13 parts)"
-        await seen.run('document.querySelector("#health summary").click()')
+        await seen.click_on('document.querySelector("#health summary")')
         await seen.until('document.getElementById("health").innerText.includes("part_3 says so")')
         labels = await seen.run("window.labels")
         assert len(labels) == 13
@@ -909,7 +909,7 @@ async def test_a_whole_robot_is_one_line_that_opens_and_its_labels_keep_apart(
                 assert apart
         assert await seen.run("document.documentElement.scrollWidth") == width
         # One part needs no more height than the window has.
-        await seen.run('document.querySelectorAll("#parts button")[1].click()')
+        await seen.click_on('document.querySelectorAll("#parts button")[1]')
         await seen.until('document.getElementById("stage").offsetHeight < innerHeight')
 
 
@@ -944,5 +944,5 @@ async def test_the_imported_arm_of_an_icub_is_drawn(robot: Stack, tmp_path: Path
         assert parts == ["all", "left_arm", "left_forearm"]
         assert await seen.run(DRAWN) > 20_000
         for part in (1, 2):  # each alone: the tiled one, and the one that is curved in space
-            await seen.run(f'document.querySelectorAll("#parts button")[{part}].click()')
+            await seen.click_on(f'document.querySelectorAll("#parts button")[{part}]')
             await seen.until(f"{DRAWN} > 20_000")

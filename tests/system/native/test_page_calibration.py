@@ -84,9 +84,9 @@ async def calibrating(
 
 async def calibrate(seen: Page) -> None:
     await seen.until(MAY_CALIBRATE)
-    await seen.run('document.getElementById("calibrate").click()')
+    await seen.click_on('document.getElementById("calibrate")')
     await seen.until('document.getElementById("confirm").open')
-    await seen.run('document.querySelector("#confirm button.do").click()')
+    await seen.click_on('document.querySelector("#confirm button.do")')
 
 
 async def shows(seen: Page, wanted: str) -> None:

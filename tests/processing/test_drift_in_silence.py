@@ -1,0 +1,61 @@
+"""A board that was away while the skin became warmer or colder feels what touches it then."""
+
+import numpy as np
+import pytest
+
+from emulator.probes.scene import Air, Place, Probe, Scene, Temperature
+from tests.support.fault_bench import FaultBench
+
+CALIBRATED_S = 12.0
+SILENT_S = 240.0
+PART = "left_hand"
+
+
+def away(
+    warmer_c: float, *, probe: list[Probe] | None = None, air: list[Air] | None = None
+) -> FaultBench:
+    """A robot whose hand was not received for some minutes, in which it became warmer."""
+    times_c = [(0.0, 25.0), (CALIBRATED_S, 25.0), (CALIBRATED_S + SILENT_S, 25.0 + warmer_c)]
+    scene = Scene(temperature=Temperature(keyframes_c=times_c), probe=probe or [], air=air or [])
+    bench = FaultBench(scene=scene)
+    mend = bench.inject("board_silent", board="hand")
+    bench.run(SILENT_S)
+    mend()
+    return bench
+
+
+@pytest.mark.parametrize("warmer_c", [-4.0, -1.5, 1.5, 4.0])
+def test_what_drifted_while_a_board_was_away_is_no_touch(warmer_c: float) -> None:
+    """Most pads would be touched, and stay it, because a touch hides drift."""
+    bench = away(warmer_c)
+    touched = []
+    for _ in range(200):
+        bench.run(0.05)
+        touched.append(np.count_nonzero(bench.touched[PART]))
+    assert max(touched) <= 1
+    assert touched[-1] == 0
+    assert np.count_nonzero(bench.valid[PART]) > 90
+
+
+def test_what_came_on_some_pads_meanwhile_is_a_touch_of_these() -> None:
+    press = Probe(
+        part=PART,
+        at=Place(triangle=4),
+        diameter_mm=9,
+        force_n=[(0.0, 0.0), (1.0, 4.0), (1000.0, 4.0)],
+        start_s=CALIBRATED_S + SILENT_S / 2,
+    )
+    bench = away(2.0, probe=[press])
+    bench.run(2.0)
+    pressed = bench.robot.true_pressure_kpa(PART) > 20.0
+    assert np.count_nonzero(pressed) >= 2
+    np.testing.assert_array_equal(bench.touched[PART], pressed & bench.valid[PART])
+
+
+def test_what_came_on_all_pads_while_it_became_no_warmer_is_no_drift() -> None:
+    """All pads read what a few degrees make, but for temperature pads."""
+    course = [(0.0, 0.0), (60.0, 6.0), (1000.0, 6.0)]
+    bench = away(0.0, air=[Air(part=PART, pressure_kpa=course, start_s=CALIBRATED_S)])
+    bench.run(2.0)
+    reported_untouched = bench.valid[PART] & ~bench.touched[PART]
+    assert np.count_nonzero(reported_untouched) < 50
