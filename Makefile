@@ -58,7 +58,8 @@ test-beside: test-long
 
 test-native: .venv/dev.stamp .venv/fuzz.stamp
 	@tools/timed "on this host: broker, browser, the lane itself" \
-		$(BIN)/python -m pytest tests/system/native --require-mosquitto $(AGAIN)
+		$(BIN)/python -m pytest tests/system/native --require-mosquitto \
+		--numprocesses=2 --dist=loadfile --no-loadscope-reorder $(AGAIN)
 
 test-long: .venv/dev.stamp
 	@tools/timed "on this host: what computes for long" nice -n 19 \

@@ -175,7 +175,9 @@ class Stamps:
         is not of a known clock.
         """
         differs_s = now_s - stamp_s
-        if not abs(differs_s - self._behind_s) <= PLAUSIBLE_S:
+        # After one of another clock, one that waited for long is of that, too.
+        most_s = PROOF_S if self._other_s < math.inf else PLAUSIBLE_S
+        if not abs(differs_s - self._behind_s) <= most_s:
             self._note_other(differs_s, now_s)
             return None
         if self._other_s < math.inf:

@@ -14,6 +14,7 @@ import pytest
 
 from emulator.probes.scene import Scene
 from skin_host.bus.logs import read_channels
+from skin_host.clock import Clock
 from skin_host.config.settings import skin_hash
 from skin_host.daemon.daemon import Daemon
 from skin_host.daemon.state import NodeState, load_kept
@@ -167,6 +168,7 @@ async def test_a_clock_that_is_set_by_an_hour_costs_a_sweep_at_most_and_accuses_
     step = 0.0
     monkeypatch.setattr(time, "time", lambda: real["time"]() + step)
     monkeypatch.setattr(time, "time_ns", lambda: real["time_ns"]() + int(step * 1e9))
+    monkeypatch.setattr(Clock, "now_ns", staticmethod(time.time_ns))
     async with daemon_of(four_parts(tmp_path), QUIET) as daemon:
         await until(lambda: all(map(believed, daemon.records().values())))
         step = step_s
