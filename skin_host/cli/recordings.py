@@ -237,7 +237,6 @@ def _record(arguments: argparse.Namespace) -> int:
             told = run(partial(_capture, arguments, recorder, None), arguments.seconds)
             if not recorder.messages:
                 _require_frames(arguments, 0)
-                raise SkinError(f"{file}: nothing is recorded; it ended before any robot answered")
         told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
     else:
         can_suffix(file)
@@ -285,15 +284,11 @@ async def _capture(
     import asyncio
 
     from skin_host.recording.capture import capture_broker, capture_buses
-    from skin_host.tasks import until
 
     told: dict[str, Any] = {}
 
     async def from_broker() -> None:
-        found = await until(stop, _robot(arguments.broker or LOCAL, arguments.robot))
-        if found is None:
-            return
-        broker, base, robot = found
+        broker, base, robot = await _robot(arguments.broker or LOCAL, arguments.robot)
         told["gaps"] = await capture_broker(recorder, broker, base, robot, stop)
         told["messages_lost"] = recorder.discarded
 

@@ -527,7 +527,8 @@ class BoardZeros:
             if rezero.late is not None:
                 known &= ~rezero.late
         own = self._layout.boards[sweep.board].settings
-        read_units = float(own.no_load) - self._intake.bytes_of(self._ledger.row[sweep.board])
+        raw = self._intake.bytes_of(self._ledger.row[sweep.board])
+        read_units = float(own.no_load) - raw.astype(np.float64)
         felt_units = self._pipeline.baseline[taxels] + self._pipeline.enter[taxels]
         self._silent_zeros[sweep.board] = SilentZero(
             self._pipeline.baseline[taxels],
@@ -540,6 +541,7 @@ class BoardZeros:
             touched,
             STILL_SHARE * np.maximum(read_units, felt_units),
             before,
+            read_units,
             (taxels >= 0) & (self._layout.pad_kind[taxels] == PadKind.PRESSURE),
         )
 

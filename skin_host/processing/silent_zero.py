@@ -103,11 +103,13 @@ class SilentZero:
         still_units: float64[n], a taxel that reads more than this is still touched.
         before: the same after its last silence, if what came since then has not decided: its
             baseline is still from before that.
-        pressure: bool[n], pads that measure pressure, all by default.
+        read_units: float64[n], what was read last. The baselines of temperature pads do not follow
+            drift. None if there are none of these: all pads measure pressure.
+        pressure: bool[n], pads that measure pressure.
 
     Attributes:
         silent_s, touched: as given.
-        still_units: as given, or those of `before`.
+        still_units, read_units: as given, or those of `before`.
         unseen_s: the same with all silences since the baseline was known.
         at_start: whether it is infinite.
         clear: whether a zero is so improbable by now, at least one that hides a touch, that the
@@ -126,6 +128,7 @@ class SilentZero:
         touched: Mask | None = None,
         still_units: Floats | None = None,
         before: "SilentZero | None" = None,
+        read_units: Floats | None = None,
         pressure: Mask | None = None,
     ) -> None:
         self._baseline = baseline
@@ -135,9 +138,10 @@ class SilentZero:
         self._pressure: Mask = np.ones_like(known) if pressure is None else pressure
         self.touched: Mask = np.zeros_like(known) if touched is None else touched
         if before is not None:
-            still_units = before.still_units
+            still_units, read_units = before.still_units, before.read_units
         none = np.full(len(known), np.inf)
         self.still_units: Floats = none if still_units is None else still_units
+        self.read_units: Floats = baseline if read_units is None else read_units
         self.silent_s = silent_s
         self.unseen_s: float = silent_s + (0.0 if before is None else before.unseen_s)
         self.at_start = math.isinf(self.unseen_s)
@@ -237,7 +241,7 @@ class SilentZero:
         if np.count_nonzero(warm) < REFERENCES:
             return min(SLOW_UNITS_PER_S * self.unseen_s + OWN_UNITS, MOST_DRIFTED_UNITS)
         mean, _ = self._mean_of(warm)
-        risen = float(np.mean(mean - self._baseline[warm]))
+        risen = float(np.mean(mean - self.read_units[warm]))
         return min(OWN_UNITS + max(risen, 0.0), MOST_COMMON_UNITS)
 
     def _add(self, units: Floats, present: Mask) -> None:

@@ -12,22 +12,37 @@ PART = "left_hand"
 
 
 def away(
-    warmer_c: float, *, probe: list[Probe] | None = None, air: list[Air] | None = None
+    warmer_c: float,
+    *,
+    before_c: float = 0.0,
+    probe: list[Probe] | None = None,
+    air: list[Air] | None = None,
 ) -> FaultBench:
-    """A robot whose hand was not received for some minutes, in which it became warmer."""
-    times_c = [(0.0, 25.0), (CALIBRATED_S, 25.0), (CALIBRATED_S + SILENT_S, 25.0 + warmer_c)]
-    scene = Scene(temperature=Temperature(keyframes_c=times_c), probe=probe or [], air=air or [])
+    """A robot whose hand was not received for some minutes, in which it became warmer.
+
+    It became warmer by `before_c` in as long a time before, which its zeros followed.
+    """
+    lost_s = CALIBRATED_S + SILENT_S * (before_c != 0.0)
+    warm_c = 25.0 + before_c
+    course_c = [(CALIBRATED_S, 25.0), (lost_s, warm_c), (lost_s + SILENT_S, warm_c + warmer_c)]
+    scene = Scene(
+        temperature=Temperature(keyframes_c=sorted(set(course_c))), probe=probe or [], air=air or []
+    )
     bench = FaultBench(scene=scene)
+    bench.run(lost_s - CALIBRATED_S)
     mend = bench.inject("board_silent", board="hand")
     bench.run(SILENT_S)
     mend()
     return bench
 
 
-@pytest.mark.parametrize("warmer_c", [-4.0, -1.5, 1.5, 4.0])
-def test_what_drifted_while_a_board_was_away_is_no_touch(warmer_c: float) -> None:
+@pytest.mark.parametrize(
+    ("before_c", "warmer_c"),
+    [(0.0, -4.0), (0.0, -1.5), (0.0, 1.5), (0.0, 4.0), (-3.0, 2.0), (3.0, -2.0)],
+)
+def test_what_drifted_while_a_board_was_away_is_no_touch(before_c: float, warmer_c: float) -> None:
     """Most pads would be touched, and stay it, because a touch hides drift."""
-    bench = away(warmer_c)
+    bench = away(warmer_c, before_c=before_c)
     touched = []
     for _ in range(200):
         bench.run(0.05)
@@ -55,7 +70,8 @@ def test_what_came_on_some_pads_meanwhile_is_a_touch_of_these() -> None:
 def test_what_came_on_all_pads_while_it_became_no_warmer_is_no_drift() -> None:
     """All pads read what a few degrees make, but for temperature pads."""
     course = [(0.0, 0.0), (60.0, 6.0), (1000.0, 6.0)]
-    bench = away(0.0, air=[Air(part=PART, pressure_kpa=course, start_s=CALIBRATED_S)])
+    air = [Air(part=PART, pressure_kpa=course, start_s=CALIBRATED_S + SILENT_S)]
+    bench = away(0.0, before_c=3.0, air=air)
     bench.run(2.0)
     reported_untouched = bench.valid[PART] & ~bench.touched[PART]
     assert np.count_nonzero(reported_untouched) < 50
