@@ -276,14 +276,19 @@ def run(
         def end() -> None:
             stop.set()
             for number in taken:
-                loop.remove_signal_handler(number)
                 if patient:
                     signal.signal(number, signal.SIG_IGN)
+                else:
+                    loop.remove_signal_handler(number)
             if signal.SIGHUP in taken:
                 _ignore_more_hangups()
 
         for number in taken:
-            loop.add_signal_handler(number, end)
+            if patient:
+                # A second one that comes as a handler of the loop is removed would end the process.
+                signal.signal(number, lambda *_: loop.call_soon_threadsafe(end))
+            else:
+                loop.add_signal_handler(number, end)
         if duration_s is not None:
             loop.call_later(duration_s, stop.set)
         return await work(stop)
