@@ -177,10 +177,8 @@ def mosquitto(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Mosqui
         if found is None:
             pytest.skip("mosquitto is not installed")
         program = found
-    broker = Mosquitto(program, tmp_path)
-    broker.start()
-    yield broker
-    broker.kill()
+    with Mosquitto(program, tmp_path) as broker:
+        yield broker
 
 
 @pytest.fixture(scope="session")

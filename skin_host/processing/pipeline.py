@@ -420,9 +420,10 @@ class _PartPipeline:
 
     def catch_up(self, units: NDArray[np.float64]) -> None:
         """See `Pipeline.catch_up`; the drift float64[n] of all taxels of the skin."""
-        drifted = units[self._mine] != 0.0
+        units = units[self._mine]
+        drifted = units != 0.0
         if any_of(drifted):
-            self.drift.catch_up(units[self._mine])
+            self.drift.catch_up(units)
             # What these sent before is no reading above the new baselines.
             self._windows.forget(drifted)
             self._renew_limits()

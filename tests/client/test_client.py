@@ -259,9 +259,7 @@ async def test_events_that_the_broker_keeps_do_not_wait_behind_states(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
     """Its room is limited, health comes every second, and a state that was kept is an old one."""
-    broker = Mosquitto(mosquitto.program, tmp_path, "max_queued_messages 50\n")
-    broker.start()
-    try:
+    with Mosquitto(mosquitto.program, tmp_path, "max_queued_messages 50\n") as broker:
         async with publishing(broker) as publisher, hearing(broker) as skin:
             touches, contacts, health = skin.touches(), skin.contacts(), skin.health()
             await skin.ready()
@@ -285,8 +283,6 @@ async def test_events_that_the_broker_keeps_do_not_wait_behind_states(
             publisher.put_health("palm", {"state": "silent"})
             assert (await take(health, 1))[0].state == "silent"
             del contacts
-    finally:
-        broker.kill()
 
 
 async def test_a_client_survives_the_broker(mosquitto: Mosquitto) -> None:

@@ -30,10 +30,7 @@ def brokers(mosquitto: Mosquitto, tmp_path: Path) -> Iterator[list[Mosquitto]]:
             folder = tmp_path / name
             folder.mkdir()
             folder.chmod(0o777)
-            one = Mosquitto(mosquitto.program, folder, "")
-            one.start()
-            stack.callback(one.kill)
-            found.append(one)
+            found.append(stack.enter_context(Mosquitto(mosquitto.program, folder, "")))
         yield found
 
 

@@ -49,10 +49,8 @@ def reading_only(mosquitto: Mosquitto, tmp_path: Path) -> Iterator[Mosquitto]:
     write = "".join(f"topic write skin/robot/{topic}\n" for topic in published)
     rules.write_text(f"topic read skin/#\n{write}")
     # As root it would become another user, who cannot read pytest's folders.
-    broker = Mosquitto(mosquitto.program, folder, f"user root\nacl_file {rules}\n")
-    broker.start()
-    yield broker
-    broker.kill()
+    with Mosquitto(mosquitto.program, folder, f"user root\nacl_file {rules}\n") as broker:
+        yield broker
 
 
 def refusal(broker: Mosquitto, topic: str) -> str:

@@ -241,16 +241,12 @@ async def test_names_without_end_are_not_kept(mosquitto: Mosquitto) -> None:
 async def test_a_broker_that_refuses_it_ends_it_with_one_line(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
-    broker = Mosquitto(mosquitto.program, tmp_path, "allow_anonymous false\n")
-    broker.start()
-    try:
+    with Mosquitto(mosquitto.program, tmp_path, "allow_anonymous false\n") as broker:
         process = await asyncio.create_subprocess_exec(
             sys.executable, EXAMPLES / "subscriber.py", str(broker.port), stderr=-1
         )
         async with asyncio.timeout(PATIENCE_S):
             _, errors = await process.communicate()
-    finally:
-        broker.kill()
     assert process.returncode == 1
     assert errors == b"the broker refuses us: Not authorized\n"
 

@@ -153,6 +153,13 @@ class Sender:
         for number in numbers:
             self.outbox.put_touch(TOPICS.part("touch", part), touch(number, part=part), None)
 
+    def put_contacts(self, payload: bytes) -> list[str]:
+        """Contact states of two parts; return their topics."""
+        topics = [TOPICS.part("contact", part) for part in ("palm", "arm")]
+        for topic in topics:
+            self.outbox.put_state(topic, payload)
+        return topics
+
     @asynccontextmanager
     async def over(self, link: Link) -> AsyncIterator["asyncio.Task[None]"]:
         """For as long as a connection lasts."""
@@ -476,16 +483,13 @@ async def test_contacts_go_before_suspected_touches_which_take_a_round_trip_each
 ) -> None:
     """The status makes valid what the broker retained of contacts."""
     sender = Sender(clock)
-    contacts = [TOPICS.part("contact", part) for part in ("palm", "arm")]
-    for topic in contacts:
-        sender.outbox.put_state(topic, b"OFF")
+    sender.put_contacts(b"OFF")
     sender.put_touches([1, 2])
     async with sender.over(Link(is_prompt=True)):  # the broker has stored them
         pass
     sender.put_touches([3, 4])
     assert await sender.rejected() is None
-    for topic in contacts:
-        sender.outbox.put_state(topic, b"ON")
+    contacts = sender.put_contacts(b"ON")
     sender.outbox.repeat_states([STATUS, *contacts])
     link = Link()
     async with sender.over(link):
@@ -504,10 +508,8 @@ async def test_suspected_contacts_go_one_at_a_time_before_suspected_touches(
     clock: SteppedClock,
 ) -> None:
     sender = Sender(clock)
-    contacts = [TOPICS.part("contact", part) for part in ("palm", "arm")]
     sender.outbox.put_state("state", b"")
-    for topic in contacts:
-        sender.outbox.put_state(topic, b"ON")
+    contacts = sender.put_contacts(b"ON")
     sender.put_touches([1, 2])
     assert await sender.rejected() is None
     went, link = [], Link()

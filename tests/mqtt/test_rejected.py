@@ -27,10 +27,8 @@ def mosquitto(mosquitto: Mosquitto, tmp_path: Path) -> Iterator[Mosquitto]:
     """One that ends the connection over a packet of 2000 bytes; with MQTT 3.1.1 unannounced."""
     folder = tmp_path / "narrow"
     folder.mkdir()
-    narrow = Mosquitto(mosquitto.program, folder, "max_packet_size 2000\n")
-    narrow.start()
-    yield narrow
-    narrow.kill()
+    with Mosquitto(mosquitto.program, folder, "max_packet_size 2000\n") as narrow:
+        yield narrow
 
 
 def wide(seq: int) -> PressureFrame:

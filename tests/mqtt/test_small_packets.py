@@ -36,10 +36,8 @@ def narrow(mosquitto: Mosquitto, tmp_path: Path) -> Iterator[Mosquitto]:
     """A broker that takes no larger packets, the one that connects included."""
     folder = tmp_path / "narrow"
     folder.mkdir()
-    broker = Mosquitto(mosquitto.program, folder, f"max_packet_size {LIMIT_BYTES}\n")
-    broker.start()
-    yield broker
-    broker.kill()
+    with Mosquitto(mosquitto.program, folder, f"max_packet_size {LIMIT_BYTES}\n") as broker:
+        yield broker
 
 
 async def test_a_node_is_online_and_offline_at_a_broker_without_room_for_its_parts(

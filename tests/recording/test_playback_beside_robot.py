@@ -186,14 +186,10 @@ def test_frames_that_the_broker_does_not_take_are_counted_and_named(
 ) -> None:
     place = tmp_path / "small"
     place.mkdir()
-    broker = Mosquitto(mosquitto.program, place, "max_packet_size 700\n")
-    broker.start()
-    try:
+    with Mosquitto(mosquitto.program, place, "max_packet_size 700\n") as broker:
         listening = Subscriber(broker.host, broker.port, "skin/#")
         status = written.replay(url_of(broker))
         hand, arm = (numbers(listening, part) for part in ("left_hand", "left_forearm"))
-    finally:
-        broker.kill()
     assert len(hand) > len(arm) == 0
     assert status == 1
     seen = capsys.readouterr()

@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Self
 
 _START_S = 30.0
 #: Ports that no client of anybody's is given, so that one stays free while its broker is away.
@@ -27,7 +28,8 @@ def free_port() -> int:
 
 
 class Mosquitto:
-    """One broker on its own port of 127.0.0.1, open to everybody, remembering nothing.
+    """One broker on its own port of 127.0.0.1, open to everybody, remembering nothing; it runs in a
+    block of `with`, or between `start` and `kill`.
 
     The port stays the same over `restart`, so that clients can find it again.
     """
@@ -71,6 +73,13 @@ class Mosquitto:
             time.sleep(0.005)
         self.kill()
         raise RuntimeError(f"mosquitto did not start:\n{self.log}")
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
 
     def stop(self) -> None:
         """End the broker as its service would: clients are told."""

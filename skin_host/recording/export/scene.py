@@ -263,8 +263,9 @@ class RecordedScene:
 def _arrow(touch: Touch) -> Arrow | None:
     if touch.event == "end" or touch.centroid_m is None:
         return None
-    force_n = touch.load.force_n if touch.load is not None else None
-    if force_n is None:
+    if touch.load is not None:
+        force_n = touch.load.force_n
+    else:
         x, y, z = touch.normal or (0.0, 0.0, 1.0)
         force_n = (-x * touch.force_n, -y * touch.force_n, -z * touch.force_n)
     return Arrow(touch.id, touch.centroid_m, force_n, touch.force_is_bound)

@@ -28,10 +28,8 @@ def broker(tmp_path: Path) -> Iterator[Mosquitto]:
     )
     # As root it would become another user, who cannot read pytest's folders.
     settings = f"user root\npassword_file {passwords}\n"
-    broker = Mosquitto(programs.require("mosquitto"), tmp_path, settings)
-    broker.start()
-    yield broker
-    broker.kill()
+    with Mosquitto(programs.require("mosquitto"), tmp_path, settings) as broker:
+        yield broker
 
 
 @pytest.fixture
