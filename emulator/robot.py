@@ -27,12 +27,13 @@ from emulator.chips.converters import Converters, fidelities
 from emulator.clock import EmulatedTime, RealClock
 from emulator.link import BoardLink
 from emulator.probes.contacts import ContactSource
-from emulator.probes.scene import Fault, Probe, Scene, check
+from emulator.probes.scene import Fault, Probe, Scene, check, check_values
 from emulator.probes.skin import NEVER_NS, Skin
 from emulator.state import StateError
 from emulator.wire import NOTHING, Wire
 from skin_host.bus.commands import Message, SetTxMode, TxMode, command_frame
 from skin_host.bus.wire import FrameBatch
+from skin_host.config.explain import LARGEST
 from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError, RequestError
 from skin_host.files import write_atomic
@@ -184,11 +185,15 @@ class Robot:
             # Nothing happens until then: a host looks more often than boards send.
             self.t_ns = self.converters.t_ns = end_ns
             return dict.fromkeys(wires, NOTHING)
+        passed: list[dict[str, FrameBatch]] = []
         while True:
             next_ns = min(end_ns, self._skin_due_ns, self._boards_due_ns, self._tips_due_ns)
             if self._agenda and self._agenda[0][0] < next_ns:
                 next_ns = self._agenda[0][0]
             self._move_to(max(self.t_ns, next_ns))
+            if self._agenda and self._agenda[0][0] <= self.t_ns:
+                # A fault of a bus that begins or ends now is none of what has passed by now.
+                passed.append({name: wire.until(self.t_ns) for name, wire in wires.items()})
             while self._agenda and self._agenda[0][0] <= self.t_ns:
                 heappop(self._agenda)[2]()
                 self._look_ahead()
@@ -200,7 +205,10 @@ class Robot:
                 self._look_ahead_at_tips()
             if self.t_ns >= end_ns:
                 break
-        return {name: wire.until(self.t_ns) for name, wire in wires.items()}
+        passed.append({name: wire.until(self.t_ns) for name, wire in wires.items()})
+        if len(passed) == 1:
+            return passed[0]
+        return {name: join([frames[name] for frames in passed]) for name in wires}
 
     def _look_ahead(self) -> None:
         """Find out when the next board is due; after anything that may have changed it."""
@@ -411,8 +419,10 @@ class Robot:
         """A probe that is moved by a program, not by the scene; its keyframes are not used.
 
         Raises:
-            ConfigurationError: there is no such part, triangle or taxel.
+            ConfigurationError: there is no such part, triangle or taxel, or another value is none
+                that a scene may have.
         """
+        check_values(probe)
         bare = probe.part in self.fingertips.boards
         live = LiveProbe(self, None if bare else self.skin.add_live(probe))
         self.fingertips.touch(probe, self.layout, live.pressing_n, live.pulling_n)
@@ -550,14 +560,15 @@ class LiveProbe:
 
     def press(self, drive: float, x_mm: float = 0.0, y_mm: float = 0.0) -> None:
         """Press from now on with a force (N), or to a depth (mm) if it is driven by depth; on skin
-        also off its place. No probe goes deeper than the foam lets it, `foam.MOST_STRAIN`.
+        also off its place. Below 0 it does not touch. No probe goes deeper than the foam lets it,
+        `foam.MOST_STRAIN`.
 
         Raises:
-            RequestError: one of them is no finite number.
+            RequestError: one of them is no number that a scene may have.
         """
-        _refuse_infinite(drive=drive, x_mm=x_mm, y_mm=y_mm)
+        _check_numbers(drive=drive, x_mm=x_mm, y_mm=y_mm)
         if self._number is None:
-            self._drive_n = drive
+            self._drive_n = max(drive, 0.0)
             return
         self._robot.skin.set_live(self._number, drive, x_mm, y_mm)
         self._robot.work_out_now()
@@ -567,9 +578,9 @@ class LiveProbe:
         force/torque board feels that.
 
         Raises:
-            RequestError: it is no finite number.
+            RequestError: it is no number that a scene may have.
         """
-        _refuse_infinite(force_n=force_n)
+        _check_numbers(force_n=force_n)
         self._pull_n = force_n
 
     def lift(self) -> None:
@@ -593,11 +604,13 @@ class LiveProbe:
         return self._pull_n
 
 
-def _refuse_infinite(**numbers: float) -> None:
-    """Refuse what would press nothing, or everything, without a word."""
+def _check_numbers(**numbers: float) -> None:
+    """Refuse what a scene may not have either."""
     for name, seen in numbers.items():
-        if not math.isfinite(seen):
-            raise RequestError(f"{name}: seen {seen}, wanted a finite number")
+        if not abs(seen) <= LARGEST:
+            raise RequestError(
+                f"{name}: seen {seen:g}, wanted a number between -{LARGEST:g} and {LARGEST:g}"
+            )
 
 
 class _StackSizes:

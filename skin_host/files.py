@@ -262,31 +262,53 @@ def _newer(path: Path, what: str, why: str) -> NewerFileError:
     )
 
 
-def set_aside(path: Path) -> None:
-    """Give a damaged file a second name, under which its content outlives its replacement.
+def give_second_name(path: Path, word: str) -> Path | None:
+    """Give a file the name `NAME.WORD-TIME`, too, under which its content outlives its replacement.
 
-    The first name stays until then: whatever start comes before finds that the file is damaged.
+    One that this user may not read loses its first name by that: it cannot be copied, and the
+    system links only one's own.
+
+    Returns:
+        This name; None if its content has such a name already.
+
+    Raises:
+        OSError: the folder is read-only, the disk is full, ...
+        BusyFileError: another program is writing the file.
     """
     import filecmp
 
     from skin_host.clock import SYSTEM
 
-    mark = f"{path.name}.damaged-"
-    aside = path.with_name(f"{mark}{SYSTEM.today():%Y%m%dT%H%M%SZ}")
+    mark = f"{path.name}.{word}-"
+    second = path.with_name(f"{mark}{SYSTEM.today():%Y%m%dT%H%M%SZ}")
+    if not os.access(path, os.R_OK):
+        path.rename(second)
+        return second
+    named = [one for one in path.parent.iterdir() if one.name.startswith(mark)]
+    readable = [one for one in named if os.access(one, os.R_OK)]
+    if any(filecmp.cmp(path, one, shallow=False) for one in readable):
+        return None
+    try:
+        os.link(path, second)
+    except OSError:  # a kind of disk without links
+        _replace(second, read_whole(path))
+    return second
+
+
+def set_aside(path: Path) -> None:
+    """Give a damaged file a second name, under which its content outlives its replacement.
+
+    The first name stays until then: whatever start comes before finds that the file is damaged.
+    """
     try:
         if not path.is_file():
             return  # a folder, a pipe: nothing is lost
-        asides = [one for one in path.parent.iterdir() if one.name.startswith(mark)]
-        if any(filecmp.cmp(path, one, shallow=False) for one in asides):
-            return  # by an earlier start
-        try:
-            os.link(path, aside)
-        except OSError:  # a kind of disk without links
-            _replace(aside, read_whole(path))
+        aside = give_second_name(path, "damaged")
     except OSError as error:
         log.error("%s: damaged, and cannot be set aside: %s", path, error.strerror)
     else:
-        log.warning("%s: damaged; set aside as %s", path, aside.name)
+        if aside is not None:
+            log.warning("%s: damaged; set aside as %s", path, aside.name)
 
 
 class Disk:
@@ -318,7 +340,8 @@ class Disk:
 
     def rename(self, temporary: Path, path: Path) -> None:
         """Let a temporary file take the place of `path`."""
-        os.chmod(temporary, 0o644)
+        with contextlib.suppress(OSError):  # a kind of disk without permissions
+            os.chmod(temporary, 0o644)
         os.replace(temporary, path)
 
     def remove(self, temporary: Path) -> None:

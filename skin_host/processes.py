@@ -163,10 +163,12 @@ def kept_from_children(*numbers: signal.Signals) -> Iterator[None]:
             signal.raise_signal(one)
 
 
-def end_with_parent() -> None:
-    """Get SIGTERM when the parent ends, however it does."""
+def end_with_parent(parent: int) -> None:
+    """Get SIGTERM when the process `parent` ends, however it does, or if it has ended already."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent:
+        signal.raise_signal(signal.SIGTERM)
 
 
 def _leave(number: int, _: object) -> None:
@@ -182,9 +184,7 @@ def _begin(parent: int) -> None:
     """End when the parent asks for that, or has ended."""
     signal.signal(signal.SIGTERM, _end)
     signal.signal(signal.SIGALRM, _end)
-    end_with_parent()
-    if os.getppid() != parent:
-        _end()
+    end_with_parent(parent)
 
 
 def _end(*_: object) -> None:

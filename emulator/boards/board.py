@@ -21,7 +21,7 @@ from skin_host.bus.answers import (
     DiscoveredBootloader,
     FirmwareVersion,
 )
-from skin_host.bus.commands import BoardType, Message
+from skin_host.bus.commands import BoardType, Discover, Message, Ping
 from skin_host.bus.compensation import thermal_gains
 from skin_host.bus.wire import TRIANGLES, FrameBatch, MessageClass, encode_values
 
@@ -165,8 +165,15 @@ class Mtb(ABC):
     def _discovered(self) -> Message:
         return Discovered(self.identity.board_type, *self.identity.firmware)
 
-    def _bootloader(self) -> Message:
-        return DiscoveredBootloader(self.identity.board_type, *self.identity.firmware[:2])
+    def _obey_in_bootloader(self, command: Message, t_ns: int) -> list[Message]:
+        """What the bootloader does instead of the application: it answers FF, and 04 ends it."""
+        match command:
+            case Discover():
+                identity = self.identity
+                return [DiscoveredBootloader(identity.board_type, *identity.firmware[:2])]
+            case Ping():
+                self.reset(t_ns)
+        return []
 
     def _firmware_version(self, *, compatible: bool) -> Message:
         identity = self.identity

@@ -241,8 +241,8 @@ class Mtb3(Mtb):
         return self.answers()
 
     def _run_if_free(self, t_ns: int) -> None:
-        """Run what has been received, if the main loop gets to it."""
-        if self._restart_ns is None and self._back_ns is None:
+        """Run what has been received, if the main loop gets to it, or the bootloader's."""
+        if self._restart_ns is not None or self._back_ns is None:
             self._run_received(t_ns)
 
     def _run_received(self, t_ns: int) -> None:
@@ -266,6 +266,8 @@ class Mtb3(Mtb):
             ]
 
     def _obey(self, command: Message, t_ns: int, *, addressed: bool) -> list[Message]:
+        if self._restart_ns is not None:
+            return self._obey_in_bootloader(command, t_ns)
         if isinstance(command, Management):
             return self._obey_management(command, t_ns, addressed=addressed)
         match command:

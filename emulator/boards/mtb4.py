@@ -20,7 +20,6 @@ from skin_host.bus.commands import (
     GetFirmwareVersion,
     GetTimeOfLife,
     Message,
-    Ping,
     SetAdditionalInfo,
     SetBoardAddress,
     SetBoardConfig,
@@ -131,12 +130,7 @@ class Mtb4(Mtb):
 
     def _obey(self, command: Message, t_ns: int) -> list[Message]:
         if self._in_bootloader_until_ns is not None:
-            match command:
-                case Discover():
-                    return [self._bootloader()]
-                case Ping():
-                    self.reset(t_ns)
-            return []
+            return self._obey_in_bootloader(command, t_ns)
         match command:
             case Discover():
                 return [self._discovered()]

@@ -86,6 +86,14 @@ class Foam:
         """The law under some taxels only."""
         return Foam(self.e0_kpa[taxels], self.stiffening[taxels], self.thickness_mm[taxels])
 
+    def and_also(self, other: "Foam") -> "Foam":
+        """The laws of this foam, then those of another."""
+        return Foam(
+            np.concatenate([self.e0_kpa, other.e0_kpa]),
+            np.concatenate([self.stiffening, other.stiffening]),
+            np.concatenate([self.thickness_mm, other.thickness_mm]),
+        )
+
     def elastic_kpa(self, strain: Floats) -> Floats:
         """sigma(x) for strains [n] below the pole."""
         value = self.e0_kpa * strain * (1 + self.stiffening * strain * strain)
@@ -309,7 +317,8 @@ class FoamLayer:
         covered = rows.covered if self._overlap is None else self._overlap.covered(strain)
         self._row_covered = covered
         borne = rows.weight * (np.where(loose, 0.0, pressure) if is_loose else pressure)
-        mean_kpa = np.bincount(rows.contact, borne, len(rows.area_mm2))
+        # Of no rows at all numpy makes whole numbers.
+        mean_kpa = np.asarray(np.bincount(rows.contact, borne, len(rows.area_mm2)), np.float64)
         if len(self._between):
             mean_kpa[~self._bears] = self._between.elastic_kpa(self._strain[~self._bears])
         self.force_n = mean_kpa * self._bears_n_per_kpa
@@ -342,14 +351,15 @@ class FoamLayer:
             len(self._unit),
         )
         law = self._law
+        if len(self._between):
+            bare = np.flatnonzero(~self._bears)
+            contact = np.concatenate([contact, bare])
+            weight = np.concatenate([weight, np.ones(len(bare))])
+            imprint = np.concatenate([imprint, np.zeros(len(bare))])
+            law = law.and_also(self._between)
         # More than any foam bears: whatever a program asks for stays a number that can be divided.
         wanted = np.minimum(np.maximum(drive.value, 0.0), _MOST_DRIVE)
         d = wanted / self._unit
-        if len(self._between):
-            bare = np.flatnonzero(~self._bears & ~drive.is_depth)
-            pressed = wanted[bare] / self._bears_n_per_kpa[bare]
-            d[bare] = Foam.uniform(len(bare)).strain(pressed)
-            d[bare] = np.minimum(d[bare], MOST_STRAIN)
         # Start value: the contact continues nearly as in the last three steps.
         last, before, earlier = self._strain, *self._strains_before
         strain = 3 * (last - before) + earlier
@@ -463,11 +473,11 @@ class FoamLayer:
 
     def _set_drive(self, drive: Drive) -> None:
         """What `_press` has to solve, but for the present value of the drive."""
-        forced = ~drive.is_depth & self._bears
+        forced = ~drive.is_depth
         self._is_moved = not forced.all()
         softness = drive.compliance_mm_per_n * self._bears_n_per_kpa / self._thickness_mm
         self._a = np.where(forced, 0.0, 1.0)
-        self._b = np.where(forced, 1.0, np.where(self._bears, softness, 0.0))
+        self._b = np.where(forced, 1.0, softness)
         self._unit = np.where(forced, self._bears_n_per_kpa, self._thickness_mm)
 
     def _recover(self) -> None:

@@ -77,6 +77,9 @@ class HeldObjects:
         self._mass_kg = mass_kg
         self._dt_s = dt_s
         self._speed = np.zeros((n, 1))
+        self._force = np.zeros((n, 1))
+        #: Time that has passed since the last inner step, or is ahead of now.
+        self._left_s = 0.0
         self.fallen_mm = np.zeros(n)
 
     @property
@@ -85,7 +88,10 @@ class HeldObjects:
         return self._contact.slipped_mm
 
     def advance(self, load_n: ArrayLike, normal_n: ArrayLike, dt_s: float) -> Floats:
-        """Let time pass; the friction force on each object, float64[n], at the end.
+        """Let time pass; the friction force on each object, float64[n], at the last inner step.
+
+        However the time is divided, the inner steps are the same: who looks more often changes
+        nothing.
 
         Args:
             load_n: [n], tangential pull.
@@ -93,11 +99,12 @@ class HeldObjects:
             dt_s: how long.
         """
         load = np.broadcast_to(np.asarray(load_n, np.float64), self.fallen_mm.shape)
-        steps = max(1, round(dt_s / self._dt_s))
-        force = np.zeros_like(self._speed)
+        self._left_s += dt_s
+        steps = max(0, round(self._left_s / self._dt_s))
+        self._left_s -= steps * self._dt_s
         for _ in range(steps):
-            force = self._contact.step(self._speed, normal_n, self._dt_s)
+            self._force = self._contact.step(self._speed, normal_n, self._dt_s)
             # N over kg is m/s2; the speed is in mm/s.
-            self._speed += 1e3 * (load[:, None] - force) / self._mass_kg * self._dt_s
+            self._speed += 1e3 * (load[:, None] - self._force) / self._mass_kg * self._dt_s
             self.fallen_mm += self._speed[:, 0] * self._dt_s
-        return force[:, 0]
+        return self._force[:, 0]

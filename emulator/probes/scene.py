@@ -15,12 +15,14 @@ from dataclasses import dataclass
 from heapq import heapify, heapreplace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 from msgspec import Meta, Struct, field
 from numpy.typing import NDArray
 
+from skin_host.config.explain import explain, out_of_bounds
 from skin_host.config.fields import Millimetres
 from skin_host.config.settings import read_toml
 from skin_host.errors import ConfigurationError, visible
@@ -165,8 +167,9 @@ class Scene(_Table):
     quiet: bool = False
     #: Viscoelastic truth of the foam, see `emulator.probes.viscoelastic`.
     foam: Literal["S", "A", "L", "H", "infinergy"] = "S"
-    #: Decay length of the surface around a contact; 0 is a plain Winkler layer.
-    membrane_mm: Annotated[float, Meta(ge=0)] = 0.0
+    #: Decay length of the surface around a contact, of real skin some 0.3 mm; 0 is a plain Winkler
+    #: layer.
+    membrane_mm: Annotated[float, Meta(ge=0, le=10)] = 0.0
     temperature: Temperature = field(default_factory=Temperature)
     probe: list[Probe] = []
     air: list[Air] = []
@@ -190,12 +193,44 @@ def load(path: Path) -> Scene:
     return scene
 
 
-def check(scene: Scene) -> None:
-    """Check properties that the types cannot express.
+def check_values(table: Scene | Probe) -> None:
+    """Check what a program has made as what comes from a file is checked: types, bounds, numbers.
 
     Raises:
         ConfigurationError: names the key.
     """
+    values = _as_read(msgspec.to_builtins(table, enc_hook=_plain))
+    try:
+        msgspec.convert(values, type(table))
+    except msgspec.ValidationError as error:
+        raise ConfigurationError(explain(values, error, type(table), {})) from None
+    # A seed is no quantity, and values of faults have bounds of their own.
+    others = {"seed": 0, "fault": [{**one, "value": None} for one in values.get("fault", [])]}
+    for where, what in out_of_bounds({**values, **others}):
+        raise ConfigurationError(f"{where}: {what}")
+
+
+def _as_read(value: Any) -> Any:
+    """Return values with lists for tuples, as a file has them."""
+    if isinstance(value, dict):
+        return {key: _as_read(inner) for key, inner in value.items()}
+    return [_as_read(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def _plain(value: object) -> object:
+    """Return what numpy has made as Python's own numbers."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise ConfigurationError(f"seen {value!r}, wanted a value as of a file")
+
+
+def check(scene: Scene) -> None:
+    """Check the values of a scene, and properties that its types cannot express.
+
+    Raises:
+        ConfigurationError: names the key.
+    """
+    check_values(scene)
     for number, probe in enumerate(scene.probe):
         where = f"probe[{number}]"
         drives = [name for name in ("force_n", "pressure_kpa", "depth_mm") if getattr(probe, name)]

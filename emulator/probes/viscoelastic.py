@@ -37,6 +37,9 @@ STRENGTH_SD = 0.1
 #: Above this, truth S gets no faster: presses of 2 s at 160 kPa must have come back after 20 s
 #: to within the scatter of the paper's repetitions (2.3-5 kPa).
 SHIFT_LIMIT_KPA = 100.0
+#: Above this, the share that is lost grows no further with the amplitude: more would be lost than
+#: there is, and foam that carries no pressure would swell without end.
+AMPLITUDE_LIMIT_KPA = 400.0
 #: Half widths of the play operators (kPa). Each costs PLAY_SHARE of its width.
 PLAY_KPA = np.array([4.0, 12.0, 34.0])
 PLAY_SHARE = 0.03
@@ -227,7 +230,7 @@ class FoamTruth:
         law = self._law
         modes = states.modes
         if law.amplitude_per_kpa:
-            modes = modes * (1 + law.amplitude_per_kpa * modes)
+            modes = modes * (1 + law.amplitude_per_kpa * np.minimum(modes, AMPLITUDE_LIMIT_KPA))
         relaxation: Floats = self._strength[taxels] * (modes @ law.beta)
         if law.plays:
             # 0 while loading, twice the half width while unloading.

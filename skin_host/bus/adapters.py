@@ -373,6 +373,11 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
 
             bus: can.BusABC = MulticastBus(settings.channel, **options)  # type: ignore[arg-type]
             _leave_other_groups(bus, settings.channel)
+        elif settings.interface == SOCKETCAND:
+            from skin_host.bus.served import ServedBus
+
+            bus = ServedBus(settings.channel, **options)  # type: ignore[no-untyped-call]
+            _fail_if_it_vanishes(bus)
         else:
             bus = can.Bus(
                 interface=settings.interface,
@@ -380,8 +385,6 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
                 ignore_config=True,
                 **options,  # type: ignore[arg-type]
             )
-            if settings.interface == SOCKETCAND:
-                _fail_if_it_vanishes(bus)
     except Exception as error:
         # Each adapter's library has its own errors; the user gets one kind.
         why = one_line(error)

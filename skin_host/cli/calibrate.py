@@ -86,7 +86,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 
     from skin_host.client.serving import served_by_daemon
     from skin_host.daemon.alone import alone
-    from skin_host.daemon.calibrate import keep_former, take_calibration
+    from skin_host.daemon.calibrate import take_calibration
     from skin_host.daemon.memory import known_of, remembered
     from skin_host.layout import parts_of
     from skin_host.processing.calibration import with_pressures_of, with_zeros
@@ -114,26 +114,24 @@ def _calibrate(arguments: argparse.Namespace) -> int:
             "calibrating beside it "
             "would zero its boards; ask it with `skin command calibrate`, or stop it"
         )
-    zeros = remembered(settings, layout, arguments.node, take_new=True).zeros
     progress = Progress("calibrating, keep the skin untouched")
-    touched = zeros.touched
-    try:
-        with alone(settings, arguments.node):
+    with alone(settings, arguments.node):
+        zeros = remembered(settings, layout, arguments.node, take_new=True).zeros
+        try:
             found = asyncio.run(
                 take_calibration(
-                    settings, layout, parts, arguments.seconds, progress.update, touched=touched
+                    *(settings, layout, parts, arguments.seconds, progress.update),
+                    touched=zeros.touched,
                 )
             )
-    finally:
-        progress.close()
-    before = find_calibration(path, layout, found.configuration)
-    if before is not None:
-        found = going_on(found, known_of(before, zeros, layout))
-        found = with_zeros(found, before.zeros | found.zeros)
-        found = with_pressures_of(found, before)
-    elif arguments.output is None:
-        keep_former(path, layout, found.configuration)
-    write(arguments, path, found, layout)
+        finally:
+            progress.close()
+        before = find_calibration(path, layout, found.configuration)
+        if before is not None:
+            found = going_on(found, known_of(before, zeros, layout))
+            found = with_zeros(found, before.zeros | found.zeros)
+            found = with_pressures_of(found, before)
+        write(arguments, path, found, layout)
     tips = [name for name, tip in settings.fingertips.items() if tip.node == arguments.node]
     result = outcome(found, layout, parts, fingertips=tips, before=before)
     return show(result, {"file": str(path), **result}, f"kept in {path}", arguments)

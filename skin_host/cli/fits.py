@@ -129,6 +129,7 @@ def _relaxation(arguments: argparse.Namespace) -> int:
 
 def _pressure(arguments: argparse.Namespace) -> int:
     from skin_host.config.settings import skin_hash
+    from skin_host.daemon.memory import kept_calibration, share_pressures
     from skin_host.processing.calibration.file import find_calibration
     from skin_host.recording import fitting
     from skin_host.recording.load_table import check_course, read_table
@@ -140,7 +141,10 @@ def _pressure(arguments: argparse.Namespace) -> int:
         )
     settings, layout = load_skin(arguments.config)
     path = path_to_write(arguments, settings)
-    before = find_calibration(path, layout, skin_hash(settings))
+    before = None
+    if arguments.output is None:
+        before = kept_calibration(settings, layout, arguments.node)
+    before = before or find_calibration(path, layout, skin_hash(settings))
     load = None if arguments.load is None else read_table(arguments.load)
     if load is not None:
         check_course(load)
@@ -154,7 +158,12 @@ def _pressure(arguments: argparse.Namespace) -> int:
         fitted = curves = fitting.fit_curves(samples, settings, layout, load, before)
         show_fit = partial(_show_course, arguments, path, layout, curves)
     write(arguments, path, fitted.calibration, layout)
+    shares = []
+    if arguments.output is None:
+        shares = share_pressures(settings, layout, arguments.node, fitted.calibration)
     show_fit(_kept(fitted, samples, layout, arguments.pressure, path, before))
+    if shares and not arguments.json:
+        print(f"gains and curves kept for {', '.join(shares)}, too")
     return 0
 
 

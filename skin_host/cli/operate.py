@@ -6,6 +6,7 @@ import gc
 import json
 import logging
 import math
+import os
 import re
 import signal
 from collections.abc import Iterable, Iterator
@@ -81,6 +82,7 @@ def add_commands(commands: Commands) -> None:
         help="share the buses among so many processes, each a node: NODE-1, NODE-2, ...",
     )
     run.add_argument("--share", type=_share, help=argparse.SUPPRESS)
+    run.add_argument("--parent", type=count, default=os.getppid(), help=argparse.SUPPRESS)
     add_log_level(run)
     run.set_defaults(run=_run)
 
@@ -247,7 +249,7 @@ def _run_node(arguments: argparse.Namespace) -> int:
         return share_of(settings, arguments.node, *arguments.share)
 
     if arguments.share is not None:
-        end_with_parent()
+        end_with_parent(arguments.parent)
         node = share_name(arguments.node, arguments.share[0])
         settings = ours(settings)
         layout = build_layout(settings, arguments.config.parent)
@@ -314,7 +316,7 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings", layout: "L
     commands = {
         name: [
             *("run", str(arguments.config), "--node", node),
-            *("--share", f"{number}/{len(shares)}", *options),
+            *("--share", f"{number}/{len(shares)}", "--parent", str(os.getpid()), *options),
         ]
         for name, number in numbers.items()
     }

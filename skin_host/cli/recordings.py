@@ -431,7 +431,7 @@ async def _play_processed(arguments: argparse.Namespace) -> int:
     from skin_host.mqtt.address import Broker
     from skin_host.processing.core import Engine
     from skin_host.recording.playback import play_processed, played_as, refuse_live
-    from skin_host.recording.replay import slow_boards
+    from skin_host.recording.replay import mistimed_boards
 
     settings, layout = load_skin(arguments.config)
     broker, base = Broker.from_url(arguments.broker, settings.mqtt.protocol)
@@ -450,8 +450,8 @@ async def _play_processed(arguments: argparse.Namespace) -> int:
         f"{played.frames} frames played; delivered: {played.frames_sent} frames, "
         f"{played.events_sent} touch events"
     )
-    if slow := slow_boards(engine):
-        _warn_of(arguments.log, slow)
+    if mistimed := mistimed_boards(engine):
+        _warn_of(arguments.log, mistimed)
     return 0
 
 

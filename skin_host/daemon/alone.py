@@ -35,7 +35,7 @@ def alone(settings: Settings, node: str) -> Iterator[None]:
             path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_NOFOLLOW, 0o644)
             stack.callback(os.close, descriptor)
-            with contextlib.suppress(PermissionError):  # another user has made it
+            with contextlib.suppress(OSError):  # another user's, or a disk that is read-only by now
                 # Whoever may enter the folder must be able to open it, to be refused.
                 os.fchmod(descriptor, 0o644)
             try:

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import logging
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -17,7 +16,12 @@ from skin_host.config.settings import Settings, format_triangles, skin_hash
 from skin_host.daemon.link import Link
 from skin_host.daemon.state import can_be_read, kept_path, taxels_of
 from skin_host.errors import CalibrationError, OtherSkinError, SkinError
-from skin_host.files import refuse_other_robot, set_aside
+from skin_host.files import (
+    give_second_name,
+    refuse_other_robot,
+    set_aside,
+    why_unreadable,
+)
 from skin_host.health.diagnosis import named_by_part
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration, Verdict, by_part, summary
@@ -255,25 +259,32 @@ def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibra
 
 
 def keep_former(path: Path, layout: Layout, configuration: str) -> None:
-    """Give a calibration of another configuration a second name, before a new one takes its own:
-    gains and curves that were fitted are in no other file.
+    """Give a calibration of another configuration, or one that this user may not read, a second
+    name, before a new one takes its own: gains and curves that were fitted are in no other file.
+
+    Raises:
+        OSError: the folder is read-only, the disk is full, ...
+        BusyFileError: another program is writing it.
     """
     try:
         load_calibration(path, layout, configuration)
     except OtherSkinError:
-        former = path.with_name(f"{path.name}.former-{SYSTEM.today():%Y%m%dT%H%M%SZ}")
+        what = "of another configuration"
+        mend = "fit them again with skin calibrate CONFIG --pressure LOG"
     except SkinError:
-        return
+        why = why_unreadable(path)
+        if why is None:
+            return
+        what, mend = f"cannot be read: {why}", "let this user read that file, and put it back"
     else:
         return
-    try:
-        os.link(path, former)
-    except OSError as error:
-        log.warning("%s: of another configuration, and not kept: %s", path, error.strerror)
-        return
-    log.warning(
-        "%s: of another configuration; kept as %s. Gains and curves that were fitted to its pads "
-        "are not used any more: fit them again with skin calibrate CONFIG --pressure LOG",
-        path,
-        former.name,
-    )
+    former = give_second_name(path, "former")
+    if former is not None:
+        log.warning(
+            "%s: %s; kept as %s. Gains and curves that were fitted to its pads are not used any "
+            "more: %s",
+            path,
+            what,
+            former.name,
+            mend,
+        )

@@ -161,6 +161,7 @@ class Daemon:
             stop: set it to end.
             calibrate: take a calibration at the start even if there is one.
         """
+        self._log_thresholds()
         try:
             async with self.publisher:
                 await self._work(stop, calibrate)
@@ -349,7 +350,23 @@ class Daemon:
         self._swap(settings, layout)
         self._configured = settings
         log.info("%s read again", self._configuration)
+        self._log_thresholds()
         self._put_info(await self.clock.in_thread(self._info))
+
+    def _log_thresholds(self) -> None:
+        """Log which thresholds an operator has changed: those of the configuration do nothing."""
+        configured = msgspec.structs.asdict(self._configured.processing.touch)
+        changes = [
+            f"{key} = {value:g}"
+            for key, value in msgspec.structs.asdict(self.thresholds).items()
+            if value not in (None, configured[key])
+        ]
+        if changes:
+            log.info(
+                "%s: set by an operator, in place of the configuration's; `skin command thresholds "
+                "--reset` ends that",
+                ", ".join(changes),
+            )
 
     def records(self) -> dict[str, Record]:
         """The health record of every part, as it is now."""

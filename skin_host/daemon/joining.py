@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from skin_host.config.settings import Settings
-from skin_host.daemon.state import NodeState, Zeros, seconds_of
+from skin_host.daemon.state import NodeState, Zeros, seconds_of, written_after
 from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing.calibration import Calibration, Verdict, Zero, identified, with_curves
 
@@ -31,6 +31,7 @@ class NodeMemory:
             `unknown`, and only baselines of this calibration are left.
         from_others: some of it was in the files of other nodes only.
         unkept: which files could not be given it, and why.
+        others_s: when other nodes that had its parts wrote their zeros last, s since 1970.
     """
 
     calibration: Calibration | None
@@ -38,6 +39,7 @@ class NodeMemory:
     zeros: Zeros
     from_others: bool = False
     unkept: Mapping[str, str] = field(default_factory=dict)
+    others_s: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +134,11 @@ class Memories:
         newest = max(known, key=lambda one: one.last_s, default=None)
         if newest is not None and newest.zeros is not None:
             zeros.written = newest.zeros.written
-        return NodeMemory(calibration, state, zeros, from_others)
+        had = [one for name in (*chosen, *tips) for one in self._that_had(name)]
+        others_s = max((one.last_s[0] for one in had if one is not self._own), default=0.0)
+        if from_others and others_s:
+            zeros.written = written_after(seconds_of(zeros.written) or 0.0, others_s)
+        return NodeMemory(calibration, state, zeros, from_others, others_s=others_s)
 
     def _holder(self, name: str) -> NodeFiles | None:
         """Return the files of the node that had a part or fingertip last; None if none shows it."""

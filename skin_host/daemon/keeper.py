@@ -21,10 +21,11 @@ from skin_host.daemon.calibrate import keep_former
 from skin_host.daemon.joining import NodeMemory
 from skin_host.daemon.lasting import LastingTouches
 from skin_host.daemon.memory import known_of
-from skin_host.daemon.state import NodeState, Zeros, kept_path, taxels_of
+from skin_host.daemon.state import NodeState, Zeros, kept_path, taxels_of, written_after
 from skin_host.daemon.zeros import zeros_of
+from skin_host.errors import SkinError
 from skin_host.files import refuse_other_robot, write_document
-from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration import Calibration, with_pressures_of
 from skin_host.processing.calibration.calibrator import Known
 from skin_host.processing.calibration.file import find_calibration, save_calibration
 from skin_host.processing.core import Engine
@@ -60,6 +61,7 @@ class Keeper:
         self._clock = clock
         self._state = memory.state
         self._zeros = memory.zeros
+        self._others_s = memory.others_s
         self.unkept = dict(memory.unkept)
         #: Id of the calibration in the file, which a start would find; empty if not known.
         self._stored = ""
@@ -98,10 +100,7 @@ class Keeper:
             NewerFileError: a newer version has written it.
             BusyFileError: another program is writing it.
         """
-        path, layout = self._path["calibration"], self._engine.layout
-        await self._clock.in_thread(refuse_other_robot, path, layout.robot, "calibration")
-        configuration = self._engine.configuration
-        found = await self._clock.in_thread(find_calibration, path, layout, configuration)
+        found = await self._clock.in_thread(self._in_file)
         self._stored = "" if found is None else found.id
         return found
 
@@ -127,10 +126,6 @@ class Keeper:
                 await self._zeros_written()
                 self._begin(self._keep_zeros(doubted=doubted))
                 await self._zeros_written()
-            layout, configuration = self._engine.layout, self._engine.configuration
-            await self._clock.in_thread(
-                keep_former, self._path["calibration"], layout, configuration
-            )
             await self._write_calibration()
 
     async def keep_state(self, state: NodeState) -> bool:
@@ -227,7 +222,7 @@ class Keeper:
         )
         is_news = zeros != before and bool(zeros.baselines or _doubts(zeros) or _doubts(before))
         if is_news or anyway or "zeros" in self.unkept:
-            zeros.written = self._clock.today().isoformat(timespec="seconds")
+            zeros.written = written_after(self._clock.today().timestamp(), self._others_s)
             # What is being written counts as kept: what is asked for later is written after it.
             self._zeros = zeros
             if not await self._write("zeros", lambda path: write_document(path, zeros)):
@@ -235,12 +230,32 @@ class Keeper:
         self._n_kept = n_found
 
     async def _write_calibration(self) -> None:
-        found, layout = self._engine.calibration, self._engine.layout
-        if found is not None and await self._write(
-            "calibration", lambda path: save_calibration(path, found, layout)
-        ):
-            self._stored = found.id
-            log.info("calibration %s kept in %s", found.id, self._path["calibration"])
+        """Write the calibration in use, with the gains and curves of one that another program has
+        written since: they may be in no other file.
+        """
+        found, known = self._engine.calibration, self._stored
+        layout, configuration = self._engine.layout, self._engine.configuration
+        if found is None:
+            return
+        kept = found
+
+        def write(path: Path) -> None:
+            nonlocal kept
+            before = self._in_file()
+            if before is not None and before.id != known:
+                kept = with_pressures_of(found, before)
+            keep_former(path, layout, configuration)
+            save_calibration(path, kept, layout)
+
+        if await self._write("calibration", write):
+            self._stored = kept.id
+            log.info("calibration %s kept in %s", kept.id, self._path["calibration"])
+
+    def _in_file(self) -> Calibration | None:
+        """Read what `stored` returns."""
+        path, layout = self._path["calibration"], self._engine.layout
+        refuse_other_robot(path, layout.robot, "calibration")
+        return find_calibration(path, layout, self._engine.configuration)
 
     async def _write_state(self) -> bool:
         state = self._state
@@ -251,8 +266,8 @@ class Keeper:
         path = self._path[what]
         try:
             await self._clock.in_thread(write, path)
-        except OSError as error:
-            reason = f"{path}: {error.strerror}"
+        except (OSError, SkinError) as error:
+            reason = f"{path}: {error.strerror}" if isinstance(error, OSError) else str(error)
             if what not in self.unkept:
                 log.error("%s not kept: %s", what, reason)
             self.unkept[what] = reason

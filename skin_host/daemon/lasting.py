@@ -2,7 +2,8 @@
 
 Each write of the file costs a disk of flash some of its life, and touches come and go all the time.
 So a touch is kept only once it has lasted, and a board's touches until it has been untouched for a
-while. A board that falls silent in a touch may be zeroed in it: that is kept at once.
+while; those of a board that is touched all the time are reviewed now and then. A board that falls
+silent in a touch may be zeroed in it: that is kept at once.
 """
 
 import numpy as np
@@ -14,6 +15,9 @@ from skin_host.processing.masks import Mask
 LOOK_S = 2.0
 #: The touches of a board are kept until it has been untouched for so long.
 UNTOUCHED_S = 10.0
+#: What has not been touched since the review before is no longer kept, so often: a hand in use is
+#: never untouched, and a crash would leave all in doubt that it has ever felt.
+REVIEW_S = 30.0
 
 
 class LastingTouches:
@@ -31,7 +35,9 @@ class LastingTouches:
         self.kept: Mask = kept.copy()
         self._boards = boards
         self._before: Mask = np.zeros_like(kept)
-        self._looked_s = -np.inf
+        self._looked_s = self._reviewed_s = -np.inf
+        #: What was touched since the last review.
+        self._lately: Mask = np.zeros_like(kept)
         #: When each board was last touched.
         self._touched_s = np.full(int(boards.max(initial=-1)) + 1, -np.inf)
 
@@ -55,6 +61,11 @@ class LastingTouches:
             self._before = touched
             self._touched_s[self._boards[touched]] = now_s
             self.kept &= (now_s - self._touched_s < UNTOUCHED_S)[self._boards]
+            self._lately |= touched
+            if now_s - self._reviewed_s >= REVIEW_S:
+                self._reviewed_s = now_s
+                self.kept &= self._lately
+                self._lately = touched.copy()
         return self.kept.tobytes() != before
 
     def calibrated(self, taxels: Mask) -> None:

@@ -27,9 +27,13 @@ from skin_host.daemon.state import (
 from skin_host.errors import OtherRobotError, OtherSkinError, SkinError
 from skin_host.files import read_document, refuse_other_robot, write_document
 from skin_host.layout import Layout, parts_of
-from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration import Calibration, with_pressures_of
 from skin_host.processing.calibration.calibrator import Known
-from skin_host.processing.calibration.file import load_calibration, save_calibration
+from skin_host.processing.calibration.file import (
+    find_calibration,
+    load_calibration,
+    save_calibration,
+)
 
 log = logging.getLogger(__name__)
 
@@ -106,6 +110,40 @@ def remembered_with(
     """
     found = [_files(settings, node, calibration)]
     return Memories(settings, layout, node, node, found, []).joined()
+
+
+def kept_calibration(settings: Settings, layout: Layout, node: str) -> Calibration | None:
+    """Return the calibration that a node would start with, whose shares may have kept it; None if
+    there is none of this skin.
+
+    Raises:
+        OtherRobotError, NewerFileError, BusyFileError: see `remembered`.
+    """
+    found, former, _ = _found(settings, layout, [node], node)
+    return Memories(settings, layout, node, node, found, former).joined().calibration
+
+
+def share_pressures(
+    settings: Settings, layout: Layout, node: str, calibration: Calibration
+) -> list[str]:
+    """Give the shares of a node the gains and curves of a calibration; return their names.
+
+    They have newer zeros than a recording, so that they would not take its calibration.
+
+    Raises:
+        OSError: a file cannot be written.
+        NewerFileError, BusyFileError: see `remembered`.
+    """
+    written = []
+    family, _ = _others(settings, [node], node)
+    nodes = {part.node for part in settings.parts.values()}
+    for name in [one for one in family if one not in nodes]:
+        path = kept_path(settings, name, "calibration")
+        theirs = find_calibration(path, layout, skin_hash(settings))
+        if theirs is not None:
+            save_calibration(path, with_pressures_of(theirs, calibration), layout)
+            written.append(name)
+    return written
 
 
 def known_of(calibration: Calibration, zeros: Zeros, layout: Layout) -> Known:

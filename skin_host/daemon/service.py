@@ -26,18 +26,24 @@ _PRIORITIES = (
 
 #: Signals that ask a daemon to end.
 ENDING = (signal.SIGTERM, signal.SIGINT)
+#: In the environment: descriptor of the socket that takes the messages to systemd, and never waits,
+#: in place of the name of one (`NOTIFY_SOCKET`).
+NOTIFIED = "SKIN_NOTIFIED"
 
 
 def notify(message: str) -> None:
     """Send a message to systemd (sd_notify's protocol); without systemd, do nothing."""
-    address = os.environ.get("NOTIFY_SOCKET")
-    if not address:
+    address, descriptor = os.environ.get("NOTIFY_SOCKET", ""), os.environ.get(NOTIFIED, "")
+    if not (address or descriptor):
         return
-    import socket
-
-    if address.startswith("@"):
-        address = "\0" + address[1:]
     try:
+        if descriptor:
+            os.write(int(descriptor), message.encode())
+            return
+        import socket
+
+        if address.startswith("@"):
+            address = "\0" + address[1:]
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sock:
             sock.sendto(message.encode(), socket.MSG_DONTWAIT, address)
     except OSError:

@@ -9,7 +9,7 @@ import logging
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, TypeVar
 
@@ -26,6 +26,9 @@ from skin_host.files import read_document, refuse_other_robot, set_aside, why_un
 from skin_host.layout import Layout, PartLayout
 
 log = logging.getLogger(__name__)
+
+#: No later time can be written: the end of the year 9999.
+_LATEST_S = 253_402_300_799.0
 
 
 class Thresholds(Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -121,6 +124,17 @@ def seconds_of(time: str) -> float | None:
         return moment.timestamp() if moment.tzinfo is not None else None
     except (ValueError, OverflowError):
         return None
+
+
+def written_after(time_s: float, others_s: float) -> str:
+    """Return a time as `Zeros.written`, or one later than that of others; both in s since 1970, and
+    0 for none.
+
+    Who has taken over from others is the last one by that, whatever clocks showed meanwhile.
+    """
+    least_s = others_s + 1.0 if others_s else 0.0
+    moment = datetime.fromtimestamp(min(max(time_s, least_s), _LATEST_S), UTC)
+    return moment.isoformat(timespec="seconds")
 
 
 def taxels_of(layout: Layout, numbers: Mapping[str, list[int]]) -> NDArray[np.bool_]:

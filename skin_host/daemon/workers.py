@@ -12,18 +12,19 @@ one robot, because topics of parts do not show the node.
 
 import asyncio
 import contextlib
+import logging
 import os
 import signal
 import socket
 import sys
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 
 from skin_host.config.settings import LAST_PORT, Settings, changed, parse_triangles
 from skin_host.daemon import service
 from skin_host.errors import RequestError
 from skin_host.processes import kept_from_children
+
+log = logging.getLogger(__name__)
 
 #: Daemons end touches, stop boards and disconnect within this time; systemd waits as long for all.
 STOP_S = 4.5
@@ -35,12 +36,15 @@ class Merged:
 
     Args:
         names: of the daemons.
+
+    Attributes:
+        unfed: daemons that have not notified the watchdog since it was notified.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
         self._unready = set(names)
-        self._unfed = set(names)
+        self.unfed = set(names)
         self._status = dict.fromkeys(names, "starting")
         self._is_stopping = False
 
@@ -57,9 +61,9 @@ class Merged:
             if not self._unready:
                 told.append("READY=1")
         if said.get("WATCHDOG") == "1":
-            self._unfed.discard(name)
-            if not self._unfed:
-                self._unfed = set(self._names)
+            self.unfed.discard(name)
+            if not self.unfed:
+                self.unfed = set(self._names)
                 told.append("WATCHDOG=1")
         if "STATUS" in said:
             self._status[name] = said["STATUS"]
@@ -87,6 +91,12 @@ async def run(commands: dict[str, list[str]]) -> int:
             with contextlib.suppress(ProcessLookupError):
                 process.send_signal(number)
 
+    def abort() -> None:
+        """systemd's watchdog was not notified: the log shows where the daemon hangs that is why."""
+        for name in merged.unfed & processes.keys():
+            with contextlib.suppress(ProcessLookupError):
+                processes[name].send_signal(signal.SIGABRT)
+
     def end(number: int) -> None:
         nonlocal ending
         forward(number if ending is None else signal.SIGKILL)  # a second one ends at once
@@ -95,17 +105,17 @@ async def run(commands: dict[str, list[str]]) -> int:
     for caught in service.ENDING:
         loop.add_signal_handler(caught, end, caught)
     loop.add_signal_handler(signal.SIGHUP, forward, signal.SIGHUP)
+    loop.add_signal_handler(signal.SIGABRT, abort)
     with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="skin-run-")))
-        for number, (name, arguments) in enumerate(commands.items()):
-            path = folder / str(number)
-            _listen(stack, path, name, merged)
+        for name, arguments in commands.items():
             service.hold_hangups()  # until that daemon can take one
-            with kept_from_children(*service.ENDING):  # until that daemon takes them
+            # Until that daemon takes them.
+            with _listen(stack, name, merged) as notified, kept_from_children(*service.ENDING):
                 processes[name] = await asyncio.create_subprocess_exec(
                     # -P: this program, and not a folder of its name in the working directory.
                     *(sys.executable, "-P", "-m", "skin_host", *arguments),
-                    env=_environment(path),
+                    env=_environment(notified),
+                    pass_fds=[notified.fileno()],
                     # Ctrl-C of a terminal reaches only this process, which passes it on once.
                     start_new_session=True,
                 )
@@ -117,19 +127,35 @@ async def run(commands: dict[str, list[str]]) -> int:
         waiting = [asyncio.ensure_future(process.wait()) for process in processes.values()]
         await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
         if ending is None:
+            for name, process in processes.items():
+                number = -(process.returncode or 0)
+                if number > 0:
+                    hint = " (`journalctl -k` shows whether memory was short)"
+                    log.error(
+                        "%s: ended by signal %d (%s); all workers end with it%s",
+                        *(name, number, signal.strsignal(number)),
+                        hint if number == signal.SIGKILL else "",
+                    )
             forward(signal.SIGTERM)
         _, left = await asyncio.wait(waiting, timeout=STOP_S)
         if left:
+            hung = [name for name, process in processes.items() if process.returncode is None]
+            log.error("%s: not ended within %g s; killed", ", ".join(hung), STOP_S)
             forward(signal.SIGKILL)
         statuses = await asyncio.gather(*waiting)
     return max(status if status >= 0 else 1 for status in statuses)
 
 
-def _listen(stack: contextlib.ExitStack, path: Path, name: str, merged: Merged) -> None:
-    """Pass on a daemon's messages from the socket at `path`."""
-    sock = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-    sock.setblocking(False)
-    sock.bind(str(path))
+def _listen(stack: contextlib.ExitStack, name: str, merged: Merged) -> socket.socket:
+    """Pass on a daemon's messages; return the socket that it is to send them to.
+
+    This has no name: one in a folder of temporary files may be too long, and on others everybody
+    could write.
+    """
+    sock, notified = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    stack.enter_context(sock)
+    for one in (sock, notified):
+        one.setblocking(False)
 
     def pass_on() -> None:
         message = sock.recv(_NOTIFICATION_BYTES).decode(errors="replace")
@@ -139,13 +165,15 @@ def _listen(stack: contextlib.ExitStack, path: Path, name: str, merged: Merged) 
     loop = asyncio.get_running_loop()
     loop.add_reader(sock.fileno(), pass_on)
     stack.callback(loop.remove_reader, sock.fileno())
+    return notified
 
 
-def _environment(notify_socket: Path) -> dict[str, str]:
+def _environment(notified: socket.socket) -> dict[str, str]:
     """Of a daemon; systemd's watchdog time holds for it, whatever its process identifier."""
+    not_its = {"NOTIFY_SOCKET", "WATCHDOG_PID"}
     return {
-        **{key: value for key, value in os.environ.items() if key != "WATCHDOG_PID"},
-        "NOTIFY_SOCKET": str(notify_socket),
+        **{key: value for key, value in os.environ.items() if key not in not_its},
+        service.NOTIFIED: str(notified.fileno()),
     }
 
 

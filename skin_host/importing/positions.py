@@ -24,11 +24,11 @@ from skin_host.config.settings import (
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError
-from skin_host.importing.report import Findings, integer, read_source, with_part
+from skin_host.importing.report import Findings, integer, part_name, read_source, with_part
 from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
 from skin_host.layout.geometry import LARGEST_NUMBER, fit_unit
 
-LARGEST_FILE = 20_000_000
+LARGEST_FILE = 2_000_000
 TAXELS_PER_BOARD = TAXELS_PER_TRIANGLE * TRIANGLES_PER_BOARD
 #: Temperature pads of the triangle with ten pads.
 THERMAL_PADS = (6, 10)
@@ -136,7 +136,7 @@ def import_positions(
     for file in files:
         table = read_table(file, findings)
         if base is None:
-            name = part or re.sub(r"[^a-z0-9_-]", "_", file.stem.lower())[:60]
+            name = part_name(part or file.stem)
             settings = _with_boards(settings, name, table, findings)
         else:
             name = part or _part_of(file, settings)
@@ -170,7 +170,9 @@ def _with_boards(settings: Settings, name: str, table: Table, findings: Findings
             numbers = [slot - first for slot in on]
             boards[first // TRIANGLES_PER_BOARD + 1] = numbers, _kind(table, on)
     if not boards or n_boards > 14:
-        raise ConfigurationError(f"{table.file}: {len(boards)} boards with places; wanted 1 to 14")
+        raise ConfigurationError(
+            f"{table.file}: rows of {n_boards} boards, {len(boards)} with places; wanted 1 to 14"
+        )
     return with_part(settings, table.file, name, boards, findings)
 
 

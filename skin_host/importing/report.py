@@ -19,6 +19,8 @@ from skin_host.files import read_whole
 #: Most remarks of a grade that are printed, and most characters of one.
 MOST, LONGEST = 100, 300
 _LONGEST_NUMBER = 12
+#: A board's name has its address besides.
+_LONGEST_NAME = 60
 
 #: A file and a line of it; 0 means the file as a whole.
 Place = tuple[Path, int]
@@ -99,6 +101,11 @@ def integer(word: str) -> int | None:
         return None
     value = int(match[2], 16 if match[2][:2].lower() == "0x" else 10)
     return -value if match[1] == "-" else value
+
+
+def part_name(text: str) -> str:
+    """The name of a part made from any text: a file's name, or a key of it."""
+    return re.sub(r"[^a-z0-9_-]+", "_", text.lower()).strip("_")[:_LONGEST_NAME] or "skin"
 
 
 def new_bus(

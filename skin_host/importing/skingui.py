@@ -22,7 +22,7 @@ from skin_host.config.settings import (
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError
-from skin_host.importing.report import Findings, integer, read_source, with_part
+from skin_host.importing.report import Findings, integer, part_name, read_source, with_part
 from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
 
 LARGEST_FILE = 1_000_000
@@ -119,7 +119,7 @@ def read_display(path: Path, findings: Findings) -> Display:
         raise ConfigurationError(f"{path}: contains no unit; wanted lines after [SENSORS]")
     if gains:
         findings.dropped((path, 0), f"gain {', '.join(sorted(gains))}: brightness of the display")
-    part = (keys.get("robotPart") or [path.stem])[0].lower().replace(" ", "_")
+    part = part_name((keys.get("robotPart") or [path.stem])[0])
     numbers = map(integer, keys.get("cardid", []))
     addresses = [address for address in numbers if address is not None]
     return Display(path, part, addresses, units)

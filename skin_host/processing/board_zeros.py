@@ -24,6 +24,7 @@ from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pipeline import Pipeline
 from skin_host.processing.pressed_zero import PressedZero
+from skin_host.processing.returned_chips import ReturnedChips
 from skin_host.processing.rezero import (
     BELOW_SWEEPS,
     END,
@@ -99,6 +100,9 @@ class BoardZeros:
         self.held: Mask | None = None
         #: Boards that were silent and may have been zeroed meanwhile.
         self._silent_zeros: dict[int, SilentZero] = {}
+        self._returned = ReturnedChips(
+            {board: np.any(self._of(board) >= 0, axis=1) for board in boards}
+        )
         #: Boards that have neither sent nor been zeroed since they were held.
         self._awaited: set[int] = set()
         #: Boards of which taxels are not valid, or were not just now, as their zero is sought.
@@ -134,6 +138,7 @@ class BoardZeros:
         self.found, self.changes = before.found, before.changes
         self.rezeros, self.held = before.rezeros, before.held
         self._silent_zeros = before._silent_zeros
+        self._returned.go_on(before._returned)
         self._awaited = before._awaited
         self._glimpses = before._glimpses
         self._unanswered = before._unanswered
@@ -153,6 +158,7 @@ class BoardZeros:
         for board in boards:
             self.rezeros.pop(board, None)
             self._silent_zeros.pop(board, None)
+            self._returned.forget(board)
             self._glimpses.pop(board, None)
             self._at_end.pop(board, None)
             self._pressed.pop(board, None)
@@ -178,6 +184,8 @@ class BoardZeros:
             self._note_return(sweep, math.inf)
         if ledger.flagged[row] or self._unanswered:
             self._note_unanswered(sweep, row)
+        if ledger.flagged[row] or self._returned.watches(sweep):
+            self._note_unread(sweep, row)
         if row in ledger.twice:
             self._note_twice(sweep, row)
             return
@@ -197,6 +205,8 @@ class BoardZeros:
             silent_zero = self._silent_zeros.get(sweep.board)
             if silent_zero is not None:
                 self._find_silent_zero(sweep, row, silent_zero)
+        if sweep.board in self._returned.compared:
+            self._compare_chips(sweep, row)
         if self.rezeros or self._silent_zeros or self._glimpses:
             self._note_glimpse(sweep, row)
 
@@ -280,6 +290,7 @@ class BoardZeros:
             How many taxels were touched.
         """
         taxels = self._of(board)
+        self._returned.forget(board)
         silent_zero = self._silent_zeros.pop(board, None)
         if silent_zero is not None and silent_zero.at_start and silent_zero.was_zeroed:
             self._judge_again(board)
@@ -516,6 +527,26 @@ class BoardZeros:
             before = None
         if self._pipeline is None or self._calibration is None or sought:
             return
+        self._silent_zeros[sweep.board] = self._comparison(sweep, silent_s, before)
+
+    def _comparison(
+        self,
+        sweep: Sweep,
+        silent_s: float,
+        before: SilentZero | None = None,
+        only: Mask | None = None,
+    ) -> SilentZero:
+        """Return what compares the sweeps of a board with its zeros; see `SilentZero`.
+
+        Args:
+            sweep: its first.
+            silent_s: for how long it, or what of it is compared, was not received.
+            before: the same after its last silence, if that has not decided.
+            only: bool[192], the taxels that are compared, all by default.
+        """
+        assert self._pipeline is not None
+        assert self._calibration is not None
+        rezero = self.rezeros.get(sweep.board)
         taxels = self._of(sweep.board).ravel()
         touched = (taxels >= 0) & self._last_touched[taxels]
         if before is not None:
@@ -526,11 +557,14 @@ class BoardZeros:
             known &= ~rezero.cut_off
             if rezero.late is not None:
                 known &= ~rezero.late
+        if only is not None:
+            known &= only
+            touched &= only
         own = self._layout.boards[sweep.board].settings
         raw = self._intake.bytes_of(self._ledger.row[sweep.board])
         read_units = float(own.no_load) - raw.astype(np.float64)
         felt_units = self._pipeline.baseline[taxels] + self._pipeline.enter[taxels]
-        self._silent_zeros[sweep.board] = SilentZero(
+        return SilentZero(
             self._pipeline.baseline[taxels],
             self._calibration.noise[taxels],
             self._calibration.spread[taxels],
@@ -544,6 +578,34 @@ class BoardZeros:
             read_units,
             (taxels >= 0) & (self._layout.pad_kind[taxels] == PadKind.PRESSURE),
         )
+
+    def _note_unread(self, sweep: Sweep, row: int) -> None:
+        """See which chips are not read, and compare those that are again after a long time."""
+        read = self._ledger.present[row] & (self._ledger.error[row] == 0)
+        if row in self._ledger.twice:
+            read = np.zeros_like(read)
+        back = self._returned.note(sweep.board, read, self._ledger.now_ns)
+        rezero = self.rezeros.get(sweep.board)
+        sought = sweep.board in self._silent_zeros or (rezero is not None and rezero.seeks_all)
+        if back is None or sought or self._pipeline is None or self._calibration is None:
+            return
+        # What temperature pads read before is not known: their chip was not read, either.
+        pads = self._layout.pad_kind[self._of(sweep.board).ravel()] == PadKind.PRESSURE
+        pads &= np.repeat(back[0], PADS)
+        comparison = self._comparison(sweep, back[1], only=pads)
+        self._returned.compared[sweep.board] = back[0], comparison
+
+    def _compare_chips(self, sweep: Sweep, row: int) -> None:
+        """Keep chips that were not read for long from being valid until their drift is known."""
+        here = np.repeat(self._ledger.present[row] & (self._ledger.error[row] == 0), PADS)
+        unknown, drifted_units = self._returned.step(sweep, here & ~self._ledger.far[row].ravel())
+        if drifted_units is not None and self._pipeline is not None:
+            taxels = self._of(sweep.board).ravel()
+            self._pipeline.catch_up(taxels[taxels >= 0], drifted_units[taxels >= 0])
+        self._renew_veto(sweep, row)
+        if any_of(unknown):
+            veto = self._intake.veto.get(row, np.zeros((TRIANGLES, PADS), np.bool_))
+            self._intake.veto[row] = veto | unknown[:, None]
 
     def _judge_again(self, board: int) -> None:
         """A board was zeroed before a start, so that what seemed to touch it since was judged by
@@ -586,6 +648,10 @@ class BoardZeros:
         if drifted_units is not None and self._pipeline is not None:
             taxels = self._of(sweep.board).ravel()
             self._pipeline.catch_up(taxels[taxels >= 0], drifted_units[taxels >= 0])
+        self._renew_veto(sweep, row)
+
+    def _renew_veto(self, sweep: Sweep, row: int) -> None:
+        """Let all taxels of a board be valid but those whose zero is not known, or not yet."""
         rezero = self.rezeros.get(sweep.board)
         if rezero is None:
             self._intake.veto.pop(row, None)

@@ -63,6 +63,8 @@ MOST_SQUARE = 25.0
 CLEAR_SWEEPS = 2
 #: Rounding, and what the baseline of a pad drifts by itself (units, standard deviation).
 OWN_UNITS = 0.5
+#: A silence must be longer than this for that to count.
+DRIFT_S = OWN_UNITS / SLOW_UNITS_PER_S
 #: What all pads of a board drift by together (units, standard deviation), however short the
 #: silence was; in a long one this grows by `SLOW_UNITS_PER_S`, up to a limit.
 COMMON_UNITS = 1.0
@@ -204,7 +206,7 @@ class SilentZero:
     @property
     def _drifts(self) -> bool:
         """Whether pads may have drifted so much together that it counts where they rest now."""
-        return SLOW_UNITS_PER_S * self.unseen_s > OWN_UNITS
+        return self.unseen_s > DRIFT_S
 
     def drifted_units(self) -> Floats | None:
         """Return by how much the untouched readings [n] have drifted in a long silence without a

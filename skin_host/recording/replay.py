@@ -257,8 +257,8 @@ def calibrate_from_log(
     """Calibrate on the first `seconds` of a recording, longer only if nothing is known from these.
 
     Raises:
-        LogError: unreadable, without a single sweep of this skin, or of boards that send so much
-            more slowly than configured that nothing of them counts.
+        LogError: unreadable, without a single sweep of this skin, or of boards that send at so
+            different a period than configured that nothing of them counts.
     """
     engine = Engine(settings, layout, list(range(len(layout.parts))))
     engine.begin_calibration(seconds, NOISE_SAMPLES)
@@ -274,35 +274,44 @@ def calibrate_from_log(
             f"({sum(one.unknown_board for one in counters)} of other boards); wanted a recording "
             "made with this CONFIG, see `skin check CONFIG`"
         )
-    if not engine.calibration_progress() and (slow := slow_boards(engine)):
-        raise LogError(f"{log}: {slow}")
+    if not engine.calibration_progress() and (mistimed := mistimed_boards(engine)):
+        raise LogError(f"{log}: {mistimed}")
     # A recording's calibration carries the recording's time, so that replays stay equal.
     time = datetime.fromtimestamp(last_ns / 1e9, UTC).isoformat(timespec="seconds")
     return engine.end_calibration(time)
 
 
-def slow_boards(engine: Engine) -> str:
-    """Return in words which boards of a recording regularly send so slowly that each sweep ends a
-    silence; empty: none.
+def mistimed_boards(engine: Engine) -> str:
+    """Return in words of which boards of a recording little counts because they send at another
+    period than configured: regularly so slowly that each sweep ends a silence, or so fast that
+    their frames seem to be those of two boards at one address. Empty: of none.
 
     The engine has processed it: until then nothing is known of its boards.
     """
-    found = []
+    slow, fast = [], []
     for board in engine.boards:
         row = engine.ledger.row[board]
         seen_ns = engine.ledger.regular_period_ns(row) or 0.0
         own = engine.layout.boards[board]
+        configured = f"configured: {own.settings.period_ms:g} ms"
         if seen_ns > engine.ledger.silent_after_ns[row]:
-            found.append(
-                f"{own.name} sends every {seen_ns / 1e6:.0f} ms (configured: "
-                f"{own.settings.period_ms:g} ms)"
-            )
+            slow.append(f"{own.name} sends every {seen_ns / 1e6:.0f} ms ({configured})")
+        elif row in engine.ledger.twice:
+            fast.append(f"{own.name} ({configured})")
+    found = []
+    if slow:
+        found.append(
+            f"{', '.join(slow)}: so slow that each sweep comes after a silence, and little or "
+            "nothing of it counts"
+        )
+    if fast:
+        found.append(
+            f"{', '.join(fast)}: at the end frames came as often as of two boards at one address, "
+            "and nothing of such frames counts"
+        )
     if not found:
         return ""
-    return (
-        f"{', '.join(found)}: so slow that each sweep comes after a silence, and little or nothing "
-        "of it counts; wanted boards.NAME.period_ms as in the recording"
-    )
+    return "; ".join([*found, "wanted boards.NAME.period_ms as in the recording"])
 
 
 def doubts(calibration: Calibration, settings: Settings, layout: Layout) -> list[str]:
@@ -495,8 +504,8 @@ def process(
     else:
         with whole_file(task.output) as growing, growing.open("wb") as output:
             number = write_lines(task.log, engine, output, progress)
-    if slow := slow_boards(engine):
-        warn(slow)
+    if mistimed := mistimed_boards(engine):
+        warn(mistimed)
     return number
 
 

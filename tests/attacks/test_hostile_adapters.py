@@ -263,6 +263,17 @@ def served() -> Iterator[tuple[Server, Callable[[], Port]]]:
         one.close()
 
 
+async def received_until(bus: Port, number: int) -> list[int]:
+    """Return the identifiers of at least so many frames."""
+    found: list[int] = []
+    end_s = time.monotonic() + PATIENCE_S
+    while len(found) < number:
+        assert time.monotonic() < end_s, found
+        await asyncio.sleep(0.01)
+        found += bus.read().id.tolist()
+    return found
+
+
 async def test_a_server_of_buses_that_restarts_is_connected_to_again(
     served: tuple[Server, Callable[[], Port]],
 ) -> None:
@@ -274,6 +285,28 @@ async def test_a_server_of_buses_that_restarts_is_connected_to_again(
     await send_until(bus, lambda: bus.counters.reopened == 1)
     assert bus.state is LinkState.UP
     assert bus.counters.removals == 1
+
+
+async def test_frames_behind_a_damaged_line_of_a_server_of_buses_are_received_once(
+    served: tuple[Server, Callable[[], Port]],
+) -> None:
+    """python-can's client kept that line, and began with those before it again at each later one:
+    a board that had died seemed to go on, and nothing of the others was received.
+    """
+    server, open_it = served
+    bus = open_it()
+
+    def frame(can_id: int) -> bytes:
+        return b"< frame %x %.6f 4000000000000000 >" % (can_id, time.time())
+
+    server.clients[-1].sendall(frame(0x410) + b"< frame zzz 1.0 00 >" + frame(0x411))
+    received = await received_until(bus, 2)
+    for can_id in range(0x420, 0x424):
+        server.clients[-1].sendall(frame(can_id))
+        received += await received_until(bus, 1)
+    assert received == [0x410, 0x411, 0x420, 0x421, 0x422, 0x423]
+    assert bus.counters.damaged == 1
+    assert bus.state is LinkState.UP
 
 
 def test_the_connection_to_a_server_of_buses_fails_if_its_computer_vanishes(

@@ -95,6 +95,22 @@ def test_a_package_that_is_not_installed_is_asked_for_before_anything_is_read(
     assert f"need the package {package}, which is not installed; mend it with: pip" in line
 
 
+@pytest.mark.parametrize("recording", [[], ["--pressure", "LOG", "--levels", "3"]])
+def test_where_no_calibration_can_be_kept_none_is_taken(
+    tmp_path: Path, log: str, capsys: pytest.CaptureFixture[str], recording: list[str]
+) -> None:
+    """It would zero the boards, which a daemon of another state directory may use."""
+    (tmp_path / "state").write_text("a file where a folder is wanted")
+    config = tmp_path / "robot.toml"
+    service = f'[service]\nstate_directory = "{tmp_path / "state"}"\n'
+    config.write_text(Path(DEMO).read_text() + service)
+    words = [log if word == "LOG" else word for word in recording]
+    assert main(["calibrate", str(config), *words]) == 1
+    path = tmp_path / "state/demo-main.calibration.json"
+    line = f"skin calibrate: {path}: cannot be written: Not a directory"
+    assert capsys.readouterr().err.splitlines()[-1] == line
+
+
 def test_what_can_be_written_is_not_touched_by_the_check(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("kept")
     (tmp_path / "link").symlink_to(tmp_path / "elsewhere" / "file")

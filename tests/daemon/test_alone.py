@@ -1,5 +1,6 @@
 """A node runs once on a computer."""
 
+import errno
 import os
 import signal
 import stat
@@ -60,6 +61,24 @@ def test_another_user_is_refused_too(settings: Settings, tmp_path: Path) -> None
             assert stat.S_IMODE(lock.stat().st_mode) == 0o644
     finally:
         os.umask(before)
+
+
+@pytest.mark.parametrize("why", [errno.EPERM, errno.EROFS])
+def test_a_second_one_is_refused_where_the_lock_cannot_be_changed(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch, why: int
+) -> None:
+    """It is another user's, or its disk has become read-only since the first one began."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(why, os.strerror(why))
+
+    with alone(settings, "main"):
+        monkeypatch.setattr(os, "fchmod", refuse)
+        with (
+            pytest.raises(StateError, match="another daemon would zero its boards"),
+            alone(settings, "main"),
+        ):
+            pass
 
 
 def test_a_process_that_is_killed_leaves_the_node_to_others(config: Path) -> None:

@@ -4,8 +4,10 @@ import asyncio
 import errno
 import json
 import logging
+import os
 import socket
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,14 @@ from skin_host.config.settings import Bus, Mqtt, changed, load
 from skin_host.daemon import metrics
 from skin_host.daemon.calibrate import calibration_path, stored_calibration
 from skin_host.daemon.daemon import Daemon
+from skin_host.daemon.keeper import AGAIN_S
 from skin_host.daemon.memory import remembered
 from skin_host.daemon.state import NodeState, Zeros, load_kept
 from skin_host.errors import NewerFileError, OtherRobotError
 from skin_host.files import write_document
 from skin_host.layout import PadKind, build_layout
 from skin_host.mqtt.publisher import Publisher
+from skin_host.processing.calibration import with_gains
 from skin_host.processing.calibration.file import save_calibration
 from tests.support.broker import Mosquitto, free_port
 from tests.support.fault_bench import FaultBench
@@ -69,6 +73,21 @@ def test_a_damaged_state_is_set_aside_once_and_stays_until_it_is_replaced(
     assert path.read_bytes() == aside.read_bytes() == content
     write_document(path, NodeState())
     assert aside.read_bytes() == content
+
+
+def test_a_disk_without_permissions_keeps_files_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As FAT of a memory card does."""
+
+    def no_modes(path: Path, *_: object) -> None:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM), str(path))
+
+    monkeypatch.setattr(os, "chmod", no_modes)
+    path = tmp_path / "state.json"
+    write_document(path, NodeState(disabled=["left_hand"]))
+    assert load_kept(path, NodeState).disabled == ["left_hand"]
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def pressed_hand() -> Scene:
@@ -421,9 +440,6 @@ async def test_zeros_belong_to_the_calibration_that_is_kept_while_a_newer_one_is
     that still send by zeros of before, and not know what presses a pad that was zeroed in a press.
     """
 
-    def full(path: Path, *_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
-
     async with living(can_bus_settings, tmp_path, clock=clock) as live:
         await live.until_well()
         daemon, finger = live.daemon, live.finger()
@@ -435,7 +451,7 @@ async def test_zeros_belong_to_the_calibration_that_is_kept_while_a_newer_one_is
         pressed = np.array(doubted(daemon))
         finger.press(0.0)
         await clock.sleep(60.0)  # foam recovers
-        monkeypatch.setattr("skin_host.daemon.keeper.save_calibration", full)
+        monkeypatch.setattr("skin_host.daemon.keeper.save_calibration", refuse)
         await daemon.calibrate(2.0)
         await clock.sleep(3.0)
         crashed = tmp_path / "demo-main.zeros.json"
@@ -501,3 +517,83 @@ async def test_a_daemon_keeps_the_calibration_of_another_configuration_too(
         (former,) = [one for one in path.parent.iterdir() if ".former-" in one.name]
         assert former.read_text() == before
         assert json.loads(path.read_text())["configuration"] == configuration
+
+
+@stepped
+async def test_gains_that_were_fitted_while_the_disk_was_full_outlive_the_next_try_to_keep(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So do those of a disk that was mounted after the daemon had found an empty folder."""
+    with monkeypatch.context() as full:
+        full.setattr("skin_host.daemon.keeper.save_calibration", refuse)
+        async with living(can_bus_settings, tmp_path, clock=clock) as live:
+            daemon = live.daemon
+            await live.until("state_not_kept")
+            used = daemon.engine.calibration
+            assert used is not None
+            gain = np.linspace(0.5, 2.0, daemon.layout.n_taxels).round(6)
+            fitted = with_gains(replace(used, baseline=used.baseline + 3.0), gain, used.bend)
+            path = calibration_path(daemon.settings, "main")
+            save_calibration(path, fitted, daemon.layout)
+            full.undo()
+            await live.wait(lambda: not daemon.keeper.unkept)
+    kept = stored_calibration(daemon.settings, daemon.layout, "main")
+    assert kept is not None
+    np.testing.assert_array_equal(kept.gain, gain)
+    np.testing.assert_allclose(kept.baseline, used.baseline, atol=1e-6)
+    memory = remembered(daemon.settings, daemon.layout, "main")
+    assert memory.zeros.are_of(kept.id)
+
+
+@stepped
+async def test_no_later_try_to_keep_replaces_the_calibration_of_a_newer_version(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    newer = '{"schema":"skin.calibration/2"}'
+    with monkeypatch.context() as full:
+        full.setattr("skin_host.daemon.keeper.save_calibration", refuse)
+        async with living(can_bus_settings, tmp_path, clock=clock) as live:
+            await live.until("state_not_kept")
+            path = calibration_path(live.daemon.settings, "main")
+            path.write_text(newer)
+            full.undo()
+            await clock.sleep(2 * AGAIN_S)
+            assert path.read_text() == newer
+            assert "of a newer version" in live.daemon.keeper.unkept["calibration"]
+            path.unlink()
+            await live.wait(lambda: not live.daemon.keeper.unkept)
+
+
+@stepped
+async def test_a_calibration_of_another_configuration_has_one_second_name_however_often_it_is_tried(
+    clock: SteppedClock, can_bus_settings: Bus, kept: tuple[Any, Any, Path]
+) -> None:
+    *_, path = kept
+    configuration = json.loads(path.read_text())["configuration"]
+    path.write_text(path.read_text().replace(f'"{configuration}"', '"0123456789ab"'))
+    with pytest.MonkeyPatch.context() as full:
+        full.setattr("skin_host.daemon.keeper.save_calibration", refuse)
+        async with living(can_bus_settings, path.parent, clock=clock):
+            await clock.sleep(5 * AGAIN_S)
+    assert len([one for one in path.parent.iterdir() if ".former-" in one.name]) == 1
+
+
+@stepped
+async def test_a_calibration_that_may_not_be_read_is_not_lost_to_the_one_that_is_taken_without_it(
+    clock: SteppedClock, can_bus_settings: Bus, kept: tuple[Any, Any, Path]
+) -> None:
+    """Somebody has put it there as root."""
+    *_, path = kept
+    path.chmod(0)
+    if os.access(path, os.R_OK):
+        pytest.skip("root may read everything")
+    was = path.stat().st_ino
+    async with living(can_bus_settings, path.parent, clock=clock):
+        (former,) = [one for one in path.parent.iterdir() if ".former-" in one.name]
+        assert former.stat().st_ino == was
+        assert path.stat().st_ino != was
+
+
+def refuse(path: Path, *_: object) -> None:
+    """Write to a full disk."""
+    raise OSError(errno.ENOSPC, "No space left on device", str(path))

@@ -18,7 +18,7 @@ from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, changed, load
 from skin_host.daemon.calibrate import take_calibration
 from skin_host.daemon.daemon import Daemon
-from skin_host.daemon.lasting import LOOK_S, UNTOUCHED_S, LastingTouches
+from skin_host.daemon.lasting import LOOK_S, REVIEW_S, UNTOUCHED_S, LastingTouches
 from skin_host.daemon.memory import remembered
 from skin_host.files import write_document
 from skin_host.layout import build_layout, parts_of
@@ -64,6 +64,27 @@ def test_touches_of_a_board_are_kept_until_it_has_been_untouched_for_a_while(
     for look in range(4, 20):
         touches.look(mask(1), mask(), look * LOOK_S)
         assert kept(touches) == ([1, 4] if (look - 3) * LOOK_S < UNTOUCHED_S else [1])
+
+
+def test_what_a_board_in_use_no_longer_feels_is_not_kept_for_ever(touches: LastingTouches) -> None:
+    """A hand that is never untouched would keep all that it has ever felt."""
+    for look in range(3):
+        touches.look(mask(0, 1, 4), mask(), look * LOOK_S)
+    until = round(2 * REVIEW_S / LOOK_S) + 3
+    writes = sum(touches.look(mask(1, 4), mask(), look * LOOK_S) for look in range(3, until))
+    assert kept(touches) == [1, 4]
+    assert writes == 1
+
+
+def test_the_edge_of_a_contact_that_comes_and_goes_is_not_written_again(
+    touches: LastingTouches,
+) -> None:
+    touches.look(mask(0, 1), mask(), 0.0)
+    touches.look(mask(0, 1), mask(), LOOK_S)
+    for look in range(2, 100):
+        edge = mask(0, 1) if look % 10 == 0 else mask(1)
+        assert not touches.look(edge, mask(), look * LOOK_S)
+    assert kept(touches) == [0, 1]
 
 
 def test_a_touch_of_a_board_that_falls_silent_is_kept_at_once(touches: LastingTouches) -> None:

@@ -20,11 +20,19 @@ from emulator.probes.scene import Place, Probe, Scene
 from skin_host.cli import main
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Settings, changed, load, skin_hash
+from skin_host.daemon.alone import alone
 from skin_host.daemon.calibrate import calibration_path
 from skin_host.daemon.daemon import Daemon
 from skin_host.daemon.joining import NodeMemory
 from skin_host.daemon.memory import hand_over, known_of, remembered
-from skin_host.daemon.state import NodeState, Thresholds, Zeros, kept_path, load_kept
+from skin_host.daemon.state import (
+    NodeState,
+    Thresholds,
+    Zeros,
+    kept_path,
+    load_kept,
+    written_after,
+)
 from skin_host.daemon.workers import share_name, share_of
 from skin_host.errors import OtherRobotError, OtherSkinError
 from skin_host.files import set_aside, write_document
@@ -479,6 +487,51 @@ def test_a_new_calibration_needs_none_but_what_operators_changed(skin: Skin) -> 
     assert (memory.state.disabled, memory.zeros.stuck) == (["a"], {"a": [1]})
 
 
+@pytest.mark.parametrize("clock_s", [-1.7e9, 0.0])
+def test_who_took_over_stays_the_last_one_whatever_the_clock_shows(
+    skin: Skin, clock_s: float
+) -> None:
+    """A computer without a clock of its own begins in 1970 until the network has given it the time;
+    and one that was wrong once had a share end in a year that is yet to come.
+    """
+    of_share = skin.calibration(50.0, 0)
+    for number, part in enumerate(PARTS, 1):
+        zeros = Zeros(calibration=of_share.id, written=after(1e9), parts=[part])
+        skin.keep(share_name("main", number), of_share, zeros)
+    memory = skin.start()
+    assert memory.from_others
+    taken = skin.calibration(3.0, clock_s)
+    now_s = (BEGIN + timedelta(seconds=clock_s)).timestamp()
+    zeros = Zeros(calibration=taken.id, parts=memory.zeros.parts)
+    zeros.written = written_after(now_s, memory.others_s)
+    skin.keep("main", taken, zeros)
+    again = skin.start()
+    assert [skin.level(again, part) for part in PARTS] == [3.0] * len(PARTS)
+    assert not again.from_others
+
+
+def test_a_calibration_that_is_refused_as_the_node_runs_writes_no_files(skin: Skin) -> None:
+    """Files of the whole node would be taken for newer ones than those of the shares that run."""
+    for number, part in enumerate(PARTS, 1):
+        calibration = skin.calibration(50.0, number)
+        zeros = Zeros(calibration=calibration.id, written=after(10), parts=[part])
+        skin.keep(share_name("main", number), calibration, zeros)
+    folder = skin.path("main", "zeros").parent
+    before = {path.name for path in folder.iterdir()}
+    with alone(skin.settings, "main"):
+        assert main(["calibrate", str(folder / "body.toml")]) == 1
+    assert {path.name for path in folder.iterdir()} - before == {"body-main.lock"}
+
+
+async def test_a_daemon_dates_its_zeros_after_those_that_it_has_taken_over(skin: Skin) -> None:
+    of_share = skin.calibration(50.0, 0)
+    zeros = Zeros(calibration=of_share.id, written=after(1e9), parts=[*PARTS, TIP])
+    skin.keep("main-1", of_share, zeros)
+    daemon = Daemon(skin.settings, skin.layout, memory=skin.start())
+    await daemon.keeper.end()
+    assert load_kept(skin.path("main", "zeros"), Zeros).written == after(1e9 + 1)
+
+
 class Truth:
     """What is so of each part, whoever has it."""
 
@@ -629,7 +682,7 @@ def test_run_hands_what_is_remembered_to_the_daemon(
         raise OtherSkinError("enough")
 
     monkeypatch.setattr("skin_host.daemon.daemon.Daemon", make)
-    monkeypatch.setattr("skin_host.processes.end_with_parent", lambda: None)
+    monkeypatch.setattr("skin_host.processes.end_with_parent", lambda _: None)
     for words in ([], ["--share", "1/1"], ["--share", "1/1", "--calibrate"]):
         assert main(["run", str(tmp_path / "body.toml"), *words]) == 2
     assert [one.zeros.unknown for one in seen] == [{"a": [7]}] * 3

@@ -288,6 +288,37 @@ async def test_a_reload_takes_what_it_can_and_refuses_the_rest(
 
 
 @stepped
+async def test_the_log_names_thresholds_that_are_not_those_of_the_configuration(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Otherwise who changes them there sees a reload or a start that changes nothing."""
+    caplog.set_level(logging.INFO)
+    named = (
+        "margin_units = 3: set by an operator, in place of the configuration's; "
+        "`skin command thresholds --reset` ends that"
+    )
+
+    def lines() -> int:
+        return sum(record.getMessage() == named for record in caplog.records)
+
+    async with living(can_bus_settings, tmp_path / "state", clock=clock) as live:
+        daemon = live.daemon
+        daemon._configuration = config = tmp_path / "demo.toml"
+        await daemon.control.handle("thresholds", b'{"set":{"margin_units":3,"votes_of_3":2}}')
+        config.write_text(configuration_text(daemon._configured))
+        await daemon.reload()
+        assert lines() == 1
+    async with living(can_bus_settings, tmp_path / "state", clock=clock) as live:
+        daemon = live.daemon
+        daemon._configuration = config
+        assert lines() == 2
+        values = {"processing.touch.margin_units": 3.0}
+        config.write_text(configuration_text(changed(daemon._configured, values)))
+        await daemon.reload()
+        assert lines() == 2
+
+
+@stepped
 async def test_what_is_held_is_held_over_a_reload(
     clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:

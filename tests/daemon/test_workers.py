@@ -155,6 +155,7 @@ class Ends:
 
     def __init__(self) -> None:
         self.signals: list[int] = []
+        self.returncode: int | None = None
         self._ended = asyncio.Event()
 
     def send_signal(self, number: int) -> None:
@@ -163,7 +164,8 @@ class Ends:
 
     async def wait(self) -> int:
         await self._ended.wait()
-        return 0 if signal.SIGKILL not in self.signals else -signal.SIGKILL
+        self.returncode = 0 if signal.SIGKILL not in self.signals else -signal.SIGKILL
+        return self.returncode
 
 
 @pytest.mark.parametrize("asked", [signal.SIGTERM, signal.SIGINT])
@@ -222,6 +224,36 @@ async def test_a_second_stop_ends_every_daemon_at_once(monkeypatch: pytest.Monke
     assert [daemon.signals for daemon in daemons] == [wanted] * 2
 
 
+async def test_the_watchdog_ends_the_worker_that_hangs_where_it_hangs_and_the_others_in_good_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """systemd sends SIGABRT to their parent alone, whose own stack shows nothing."""
+    on_abort: list[Callable[[], object]] = []
+    daemons: list[Ends] = []
+    notified: list[int] = []
+
+    def take(number: int, handler: Callable[..., object], *_: object) -> None:
+        if number == signal.SIGABRT:
+            on_abort.append(handler)
+
+    async def start(*_: object, pass_fds: list[int], **__: object) -> Ends:
+        notified.extend(map(os.dup, pass_fds))
+        daemons.append(Ends())
+        return daemons[-1]
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "add_signal_handler", take)
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    running = asyncio.create_task(workers.run({"main-1": ["run"], "main-2": ["run"]}))
+    await until(lambda: len(daemons) == 2)
+    os.write(notified[0], b"WATCHDOG=1")
+    await asyncio.sleep(0.05)
+    on_abort[0]()
+    await asyncio.wait_for(running, PATIENCE_S)
+    for descriptor in notified:
+        os.close(descriptor)
+    assert [daemon.signals[0] for daemon in daemons] == [signal.SIGTERM, signal.SIGABRT]
+
+
 @pytest.mark.parametrize("number", ["SIGTERM", "SIGINT"])
 @pytest.mark.parametrize(
     "module", ["skin_host.__main__", "skin_host.cli", "skin_host.daemon.daemon", "can"]
@@ -244,6 +276,53 @@ async def test_a_stop_before_a_daemon_has_begun_is_a_clean_end(
     _, told = await asyncio.wait_for(process.communicate(), PATIENCE_S)
     assert process.returncode == 0, told
     assert b"Traceback" not in told
+
+
+async def test_a_worker_that_does_not_end_in_time_is_named_and_killed(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Hangs(Ends):
+        def send_signal(self, number: int) -> None:
+            self.signals.append(number)
+            if number == signal.SIGKILL or self is daemons[0]:
+                self._ended.set()
+
+    daemons: list[Hangs] = []
+
+    async def start(*_: object, **__: object) -> Hangs:
+        daemons.append(Hangs())
+        return daemons[-1]
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    monkeypatch.setattr(workers, "STOP_S", 0.05)
+    running = asyncio.create_task(workers.run({"main-1": ["run"], "main-2": ["run"]}))
+    await until(lambda: len(daemons) == 2)
+    daemons[0].send_signal(signal.SIGTERM)
+    assert await asyncio.wait_for(running, PATIENCE_S) == 1
+    assert daemons[1].signals == [signal.SIGTERM, signal.SIGKILL]
+    assert [one.getMessage() for one in caplog.records] == [
+        "main-2: not ended within 0.05 s; killed"
+    ]
+
+
+async def test_a_worker_that_is_killed_is_named(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Where memory is short the kernel kills it, and the service ends for no other reason."""
+    daemons: list[Ends] = []
+
+    async def start(*_: object, **__: object) -> Ends:
+        daemons.append(Ends())
+        return daemons[-1]
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    running = asyncio.create_task(workers.run({"main-1": ["run"], "main-2": ["run"]}))
+    await until(lambda: len(daemons) == 2)
+    daemons[1].send_signal(signal.SIGKILL)
+    assert await asyncio.wait_for(running, PATIENCE_S) == 1
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line.startswith("main-2: ended by signal 9 (Killed); all workers end with it")
+    assert "memory" in line
 
 
 async def test_a_folder_of_the_same_name_in_the_working_directory_is_not_run(
@@ -273,13 +352,16 @@ async def states(broker: Mosquitto) -> dict[str, bytes]:
 
 
 async def test_a_service_of_two_workers_is_one_robot(mosquitto: Mosquitto, tmp_path: Path) -> None:
+    """Also where the names of temporary files are longer than that of a socket may be."""
+    temporary = tmp_path / ("x" * 100)
+    temporary.mkdir()
     config = body(tmp_path / "body.toml", [("a", [0]), ("b", [1])], mosquitto.port)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))
         systemd.settimeout(PATIENCE_S)
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "skin_host", "run", config, "--workers", "2"),
-            env=os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")},
+            env=os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify"), "TMPDIR": str(temporary)},
             stderr=asyncio.subprocess.DEVNULL,
         )
         try:
@@ -327,6 +409,38 @@ async def test_workers_end_when_their_parent_is_killed(
     process.kill()
     await process.wait()
     await until(lambda: not any(map(is_running, children)))
+
+
+def written(path: Path) -> str:
+    """What a file holds; nothing while it is not there."""
+    return path.read_text() if path.exists() else ""
+
+
+@pytest.mark.parametrize("module", ["skin_host.__main__", "skin_host.daemon.daemon"])
+async def test_a_worker_ends_whose_parent_is_killed_while_it_starts(
+    tmp_path: Path, module: str
+) -> None:
+    """Nobody reports that to it."""
+    config = body(tmp_path / "body.toml", [("a", [0]), ("b", [1])], free_port())
+    act = f"""
+            os.kill(os.getppid(), signal.SIGKILL)
+            while os.getppid() == int(sys.orig_argv[sys.orig_argv.index("--parent") + 1]):
+                time.sleep(0.01)
+            open({str(tmp_path / "pid")!r}, "w").write(str(os.getpid()))
+    """
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "skin_host", "run", config, "--workers", "2"),
+        env=at_import(tmp_path, module, "1/2", act),
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    assert await asyncio.wait_for(process.wait(), PATIENCE_S) == -signal.SIGKILL
+    await until(lambda: bool(written(tmp_path / "pid")))
+    worker = int(written(tmp_path / "pid"))
+    try:
+        await until(lambda: not is_running(worker))
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(worker, signal.SIGKILL)
 
 
 def takes(pid: int, number: signal.Signals) -> bool:

@@ -1,6 +1,9 @@
 """The emulator's side of a bus that python-can reads frame by frame."""
 
 import errno
+import select
+import socket
+import threading
 from collections import deque
 
 import can
@@ -8,6 +11,7 @@ import numpy as np
 import pytest
 
 from emulator.link import MOST_READS, BoardLink
+from skin_host.bus.served import ServedBus
 from skin_host.bus.wire import FrameBatch
 
 
@@ -91,6 +95,39 @@ def test_damaged_frames_neither_end_the_emulator_nor_hide_the_commands_behind_th
     with Adapter(damage, damage, COMMAND) as bus:
         assert list(BoardLink("can0", bus).received()) == [(0x20E, b"\x07\x00")]
     assert not caplog.records
+
+
+def test_a_line_that_is_damaged_hides_no_command_of_a_server_of_buses_and_repeats_none() -> None:
+    """python-can keeps what it failed over, with what came before it, and reads that again."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        accepted: list[socket.socket] = []
+
+        def greet() -> None:
+            accepted.append(server.accept()[0])
+            accepted[0].sendall(b"< hi >")
+            for _ in ("open", "rawmode"):
+                accepted[0].recv(100)
+                accepted[0].sendall(b"< ok >")
+
+        greeting = threading.Thread(target=greet)
+        greeting.start()
+        host, port = server.getsockname()
+        with ServedBus("can0", host, port) as bus:
+            greeting.join()
+            link = BoardLink("can0", bus)
+            start, stop = b"< frame 20E 1.0 0700 >", b"< frame 20E 1.0 0701 >"
+            for damage in (b"< frame zzz 1.0 00 >", b"< frame 20E >", b"< frame 20E 1.0 0 >"):
+                received: list[list[tuple[int, bytes]]] = []
+                for sent in (stop + damage + start, start, start):
+                    accepted[0].sendall(sent)
+                    select.select([vars(bus)["_SocketCanDaemonBus__socket"]], [], [])
+                    received.append(list(link.received()))
+                assert received == [
+                    [(0x20E, b"\x07\x01"), (0x20E, b"\x07\x00")],
+                    [(0x20E, b"\x07\x00")],
+                    [(0x20E, b"\x07\x00")],
+                ]
+        accepted[0].close()
 
 
 @pytest.mark.parametrize(

@@ -169,6 +169,24 @@ def test_the_size_of_a_step_does_not_change_the_bytes() -> None:
     assert runs[0] == runs[1] == runs[2]
 
 
+@pytest.mark.parametrize(("fault", "value"), [("bus_off", None), ("babbling_node", 0.9)])
+def test_the_size_of_a_step_does_not_change_how_long_a_bus_is_disturbed(
+    fault: str, value: float | None
+) -> None:
+    """Faults that began and ended within a step were none of it, and those that ended in it were
+    over since its begin.
+    """
+    settings, layout = load("icub_hand")
+    scene = Scene(fault=[Fault(name=fault, bus="can0", at_s=3.0, until_s=3.4, value=value)])
+    runs = []
+    for dt_s in (0.01, 0.15, 3.0):
+        robot = Robot(settings, layout, scene)
+        robot.bring_up()
+        runs.append((bytes_of(robot, 3.0, dt_s), robot.wires["can0"].lost))
+    assert runs[0] == runs[1] == runs[2]
+    assert runs[0][1] > 0
+
+
 def test_frames_of_one_bus_follow_each_other_as_the_bitrate_allows() -> None:
     robot = Robot(*load())
     robot.bring_up()
@@ -490,6 +508,16 @@ def test_what_a_program_presses_loads_the_fingertip_below_it() -> None:
     assert loads_n() == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
+def test_a_program_cannot_pull_at_a_bare_fingertip_by_pressing_with_less_than_nothing() -> None:
+    robot = Robot(*load("fingertips"), Scene(noise=False))
+    robot.bring_up()
+    finger = robot.touch(Probe(part="index", force_n=[(0.0, 0.0)]))
+    finger.press(-2.0)
+    robot.step(0.1)
+    assert finger.force_n == 0.0
+    assert not robot.fingertips.force_n("index", robot.t_ns).any()
+
+
 def test_what_a_program_pulls_slides_when_friction_does_not_hold_it() -> None:
     settings, layout = load("fingertips")
     robot = Robot(settings, layout, Scene(noise=False))
@@ -618,7 +646,7 @@ def test_time_goes_forward_only(dt_s: float) -> None:
     assert robot.t_ns == 1_000_000_000
 
 
-@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf"), 1e308, -1e10])
 def test_a_probe_is_pressed_and_pulled_by_numbers_only(number: float) -> None:
     """Pressing by NaN pressed nothing, without a word."""
     robot = Robot(*load())
@@ -629,6 +657,8 @@ def test_a_probe_is_pressed_and_pulled_by_numbers_only(number: float) -> None:
         finger.press(1.0, number)
     with pytest.raises(RequestError, match="force_n: seen"):
         finger.pull(number)
+    with pytest.raises(ConfigurationError, match="diameter_mm: seen"):
+        robot.touch(Probe(part="left_hand", diameter_mm=number))
 
 
 async def test_time_that_is_left_out_in_whole_periods_of_many_seconds_is_not_taken_back() -> None:

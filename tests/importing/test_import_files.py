@@ -269,6 +269,32 @@ def test_a_strange_line_of_a_display_is_named(
     assert len(settings.parts["hand"].patches) == 2
 
 
+@pytest.mark.parametrize(
+    ("file", "key", "named"),
+    [
+        ("left arm (2)", "", "left_arm_2"),
+        ("left_arm.v2", "", "left_arm_v2"),
+        ("hand", 'robotPart "left_arm"', "left_arm"),
+        ("hand", "robotPart LEFT;arm", "left_arm"),
+        ("hand", "robotPart ]]", "skin"),
+        ("\u624b", "", "skin"),
+        ("a" * 200, "", "a" * 60),
+    ],
+)
+def test_a_part_is_named_with_the_characters_that_names_have(
+    tmp_path: Path, file: str, key: str, named: str
+) -> None:
+    """What was written was no TOML, or a table within another one, which did not name the part."""
+    display = tmp_path / f"{file}.ini"
+    display.write_text(f"{key}\n[SENSORS]\ntriangle 0 0 0 0 1\n")
+    settings, _, _ = run("skingui", display)
+    assert list(settings.parts) == [named]
+    positions = tmp_path / f"{file}.txt"
+    write_rows(positions, forearm_rows())
+    settings, _, _ = run("positions", positions, part=key.removeprefix("robotPart ") or None)
+    assert list(settings.parts) == [named]
+
+
 def test_an_address_of_a_display_that_is_no_number_of_a_board_is_not_taken(tmp_path: Path) -> None:
     """Five thousand digits ended in a traceback."""
     file = tmp_path / "hand.ini"
@@ -432,6 +458,13 @@ def test_places_of_triangles_that_are_off_and_triangles_without_places_are_named
     ]
 
 
+def test_rows_of_more_boards_than_a_bus_has_are_counted(tmp_path: Path) -> None:
+    file = tmp_path / "arm.txt"
+    write_rows(file, np.tile(forearm_rows()[:192], (20, 1)))
+    with pytest.raises(ConfigurationError, match="rows of 20 boards, 20 with places; wanted 1 to"):
+        run("positions", file)
+
+
 def test_a_positions_file_of_no_known_part_asks_for_one(tmp_path: Path, forearm: Path) -> None:
     file = tmp_path / "torso.txt"
     write_rows(file, forearm_rows())
@@ -486,7 +519,7 @@ def test_the_manager_alone_is_no_skin(tmp_path: Path) -> None:
 
 def test_nothing_is_written_when_something_is_wrong(tmp_path: Path, arm: Path) -> None:
     file = tmp_path / "hand.ini"
-    file.write_text("robotPart Hand!\ncardid 14\n[SENSORS]\nfingertip 0 0 0 0 1\n")
+    file.write_text("robotPart hand\ncardid 14\n[SENSORS]\nfingertip 0 1e9 0 0 1\n")
     before = sorted(path.name for path in tmp_path.iterdir())
     with pytest.raises(ConfigurationError, match="do not give a valid configuration"):
         run("skingui", file, arm)

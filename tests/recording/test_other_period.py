@@ -1,13 +1,14 @@
-"""Of boards that send much more slowly than configured a recording shows that, not silence."""
+"""Of boards that send at another period than configured a recording shows that, not silence."""
 
 import json
+from decimal import Decimal
 from pathlib import Path
 
 import pytest
 
 from skin_host.cli import main
 from tests.support.broker import Mosquitto
-from tests.support.limbs import calibrate, ramp, write_config, write_log
+from tests.support.limbs import HZ, calibrate, ramp, write_config, write_log
 
 
 @pytest.mark.parametrize("period_ms", [10, 20])
@@ -66,6 +67,38 @@ def test_what_is_exported_and_drawn_of_it_comes_with_the_same_warning(
             line.startswith(f"warning: {log}: a sends every 200 ms (configured: 40 ms)")
             for line in slow
         )
+
+
+def sped_up(log: Path, late_s: str) -> Path:
+    """Return a copy of a log in half the time, of which every second sweep is late by this."""
+    found = log.with_name("fast.log")
+    lines = [line.split(") ", 1) for line in log.read_text().splitlines()]
+    first_s = Decimal(lines[0][0][1:])
+    with found.open("w") as file:
+        for stamp, frame in lines:
+            passed_s = (Decimal(stamp[1:]) - first_s) / 2
+            is_late = int(float(passed_s) * HZ * 2) % 2
+            file.write(f"({first_s + passed_s + is_late * Decimal(late_s):.6f}) {frame}\n")
+    return found
+
+
+@pytest.mark.parametrize(("late_s", "is_named"), [("0", False), ("0.01", True)])
+def test_boards_whose_frames_come_as_those_of_two_at_one_address_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], late_s: str, is_named: bool
+) -> None:
+    bench = write_config(tmp_path)
+    log = sped_up(write_log(tmp_path / "slow.log", ramp(bench)[0]), late_s)
+    output = tmp_path / "fast.jsonl"
+    words = "replay", log, "--config", bench, "--output", output
+    assert main([str(word) for word in words]) == 0
+    error = capsys.readouterr().err
+    named = (
+        "a (configured: 200 ms), b (configured: 200 ms): at the end frames came as often" in error
+    )
+    assert named == is_named
+    assert ("wanted boards.NAME.period_ms as in the recording" in error) == is_named
+    last_frame = [line for line in output.read_text().splitlines() if '"frame"' in line][-1]
+    assert any(json.loads(last_frame)["valid"]) != is_named
 
 
 def test_what_is_played_of_it_to_a_broker_too(

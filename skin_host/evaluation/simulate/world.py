@@ -320,6 +320,8 @@ class PressedTip(Target):
             steps = round(PULL_S / 0.01)
             for step in range(1, steps + 1):
                 world.move()
+                if not self.pressed:
+                    break  # A stall has outlasted the press.
                 self._probe.pull(step / steps * PULL_SHARE * kpa * self._area_mm2 * 1e-3)
                 self.pulled_ns = world.clock.monotonic_ns()
                 await world.clock.sleep(0.01)

@@ -36,7 +36,7 @@ from skin_host.processing.frame import PressureFrame
 from skin_host.recording.export.columns import TABLES
 from skin_host.recording.export.known import CONTACT_STALE_S, ContactLine, Gone, Known
 from skin_host.recording.mcap import read_messages_of, robot_at
-from skin_host.recording.replay import contacts_of, replay, slow_boards
+from skin_host.recording.replay import contacts_of, mistimed_boards, replay
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -298,6 +298,6 @@ def read_frames(
         records = FingertipHealth(engine.fingertips).records(None)
         found.health.extend(health_line(name, last_ns, record) for name, record in records.items())
     found.health.sort(key=lambda line: line.t_ns)
-    if slow := slow_boards(engine):
-        warn(slow)
+    if mistimed := mistimed_boards(engine):
+        warn(mistimed)
     return found

@@ -3,7 +3,13 @@ of icub-firmware."""
 
 import pytest
 
-from skin_host.bus.answers import Discovered, FirmwareVersion, PingAnswer, ResetAnswer
+from skin_host.bus.answers import (
+    Discovered,
+    DiscoveredBootloader,
+    FirmwareVersion,
+    PingAnswer,
+    ResetAnswer,
+)
 from skin_host.bus.commands import (
     Discover,
     EnterBootloader,
@@ -183,6 +189,19 @@ def test_reset_is_acknowledged_and_executed_only_if_addressed() -> None:
     assert bench.say(EnterBootloader()) == [ResetAnswer(1)]
     bench.run(2.0)
     assert bench.board.no_load == 245
+
+
+def test_in_its_bootloader_it_answers_discovery_and_obeys_nothing_until_that_is_ended() -> None:
+    """TSD management: discovery in the bootloader has DLC 4; 04 ends it."""
+    bench = started()
+    bench.say(EnterBootloader())
+    assert bench.say(Discover()) == [DiscoveredBootloader(5, 2, 17)]
+    assert bench.board.handle(0x70F, b"\xff", bench.t_ns) == [(0x710, b"\xff\x05\x02\x11")]
+    bench.say(START)
+    assert bench.run(0.2) == []
+    assert bench.say(Ping()) == []
+    bench.run(BOOT_S)
+    assert bench.say(Discover()) == [Discovered(5, 2, 17, 0)]
 
 
 def test_not_connected_replaces_no_acknowledge() -> None:

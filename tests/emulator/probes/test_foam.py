@@ -180,6 +180,19 @@ class TestFoamLayer:
         assert layer.depth_mm == pytest.approx([0.7, 0.7])
         assert layer.force_n[0] == pytest.approx(layer.force_n[1])
 
+    @pytest.mark.parametrize("force_n", [1e-9, 1e-4, 0.0437, 3.1])
+    def test_where_there_is_no_pad_at_all_the_foam_bears_the_whole_force(self, force_n):
+        pads, layer = layer_of([[0, 0]])
+        layer.step(pads.footprint([Disc(50, 0, 20)]), Drive.by_force(force_n), 0.0)
+        assert layer.force_n == pytest.approx([force_n], rel=1e-6)
+
+    def test_a_load_cell_gives_alike_on_a_pad_and_between_the_pads(self):
+        pads, layer = layer_of([[0, 0]])
+        footprint = pads.footprint([Disc(50, 0, 6), Disc(0, 0, 6)])
+        layer.step(footprint, Drive.by_depth([1.6, 1.6], compliance_mm_per_n=0.1), 0.0)
+        assert layer.force_n[0] == pytest.approx(layer.force_n[1])
+        assert layer.depth_mm + 0.1 * layer.force_n == pytest.approx([1.6, 1.6])
+
     def test_foam_left_behind_comes_back_alike_under_a_still_and_a_sliding_probe(self):
         def left_behind(places_mm):
             pads, layer = layer_of([[0, 0], [20, 0]])

@@ -41,3 +41,19 @@ def test_an_object_falls_when_its_load_passes_the_limit_and_not_before():
     assert objects.slipped_mm[0] == 0.0
     assert objects.slipped_mm[1] > 100.0
     assert objects.fallen_mm[1] == pytest.approx(objects.slipped_mm[1], abs=1.0)
+
+
+@pytest.mark.parametrize("looks", [1, 3, 30, 100])
+def test_an_object_slides_alike_however_often_it_is_looked_at(looks):
+    """Each look let an inner step of the object pass, so that what was watched slid further."""
+    objects = HeldObjects(1, LAW, dt_s=1e-3)
+    for _ in range(100):
+        for _ in range(looks):
+            objects.advance([0.65], [1.0], 3e-3 / looks)
+        for _ in range(looks):
+            objects.advance([0.65], [1.0], 0.0)
+    alone = HeldObjects(1, LAW, dt_s=1e-3)
+    for _ in range(100):
+        alone.advance([0.65], [1.0], 3e-3)
+    assert objects.slipped_mm == pytest.approx(alone.slipped_mm)
+    assert objects.slipped_mm[0] > 10.0

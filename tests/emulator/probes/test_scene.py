@@ -1,11 +1,21 @@
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.probes.scene import Place, Probe, Scene, Script, check, load, tangents
+from emulator.probes.scene import (
+    Place,
+    Probe,
+    Scene,
+    Script,
+    check,
+    check_values,
+    load,
+    tangents,
+)
 from skin_host.cli import main
 from skin_host.errors import ConfigurationError
 
@@ -37,6 +47,7 @@ def test_the_scenes_that_come_with_the_project_are_right(path: Path) -> None:
             "[[probe]]\npart = 'a'\nforce_n = [[0, 1]]\nat = { taxel = 1, triangle = 2 }",
             r"probe\[0\].at: has both",
         ),
+        ("membrane_mm = 300", "membrane_mm: seen 300, wanted"),
         ("[temperature]\nkeyframes_c = []", "temperature.keyframes_c: is empty"),
         ("[temperature]\nkeyframes_c = [[0, -300]]", r"keyframes_c\[0\]\[1\]: seen -300, wanted"),
         ("[temperature]\nkeyframes_c = [[0, 25], [1, 1e9]]", r"keyframes_c\[1\]\[1\]: seen 1"),
@@ -182,6 +193,41 @@ def test_tangents_lie_along_the_skin(direction: tuple[float, float, float]) -> N
     along = tangents(normal)
     assert along @ along.T == pytest.approx(np.eye(2), abs=1e-9)
     assert along @ normal == pytest.approx(np.zeros(2), abs=1e-9)
+
+
+PRESS = [(0.0, 1.0), (1.0, 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("diameter_mm", 0.0, "diameter_mm: seen 0.0, wanted"),
+        ("diameter_mm", float("nan"), "diameter_mm: seen nan, wanted"),
+        ("size_mm", (0.0, 5.0), r"size_mm\[0\]: seen 0.0, wanted"),
+        ("turn_deg", float("inf"), "turn_deg: seen inf, wanted a finite number"),
+        ("repeat_s", -1.0, "repeat_s: seen -1.0, wanted"),
+        ("at", Place(taxel=-1), "at.taxel: seen -1, wanted"),
+        ("at", Place(x_mm=float("nan")), "at.x_mm: seen nan, wanted a finite number"),
+        ("force_n", [(0.0, 1.0), (1.0, float("nan"))], r"force_n\[1\]\[1\]: seen nan, wanted"),
+        ("force_n", [(0.0, 1e308), (1.0, 0.0)], r"force_n\[0\]\[1\]: seen 1e\+308, wanted"),
+    ],
+)
+def test_a_value_made_in_python_is_checked_like_one_of_a_file(
+    key: str, value: object, message: str
+) -> None:
+    """They pressed nothing, or another part's taxel, or let the robot hang, without a word."""
+    probe = msgspec.structs.replace(Probe(part="left_hand", force_n=PRESS), **{key: value})
+    with pytest.raises(ConfigurationError, match=rf"^probe\[0\].{message}"):
+        check(Scene(probe=[probe]))
+    with pytest.raises(ConfigurationError, match=f"^{message}"):
+        check_values(probe)
+
+
+def test_numbers_of_numpy_and_any_seed_are_values_of_a_scene() -> None:
+    times_s, force_n = np.linspace(0.0, 1.0, 5), np.arange(5)
+    keyframes = list(zip(times_s, force_n, strict=True))
+    probe = Probe(part="a", at=Place(taxel=np.int64(3)), force_n=keyframes)  # type: ignore[arg-type]
+    check(Scene(seed=1 << 70, probe=[probe]))
 
 
 def test_a_scene_made_in_python_is_checked_like_a_file() -> None:

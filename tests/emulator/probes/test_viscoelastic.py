@@ -47,6 +47,16 @@ class TestEveryTruth:
             before = imprint
         assert imprint < 0.5
 
+    def test_however_hard_air_presses_no_more_is_lost_than_there_is(self, kind):
+        """Losses that grew with the amplitude without end were infinite from 600 kPa on."""
+        truth = FoamTruth(kind, 1, loss=1.3)
+        for _ in range(100):
+            elastic = truth.step_pressure([10_000.0], 60.0)[0]
+        assert 10_000 < elastic < 40_000
+        for _ in range(20):
+            imprint = truth.step_pressure([0.0], 6000.0)[0]
+        assert 0 <= imprint < 0.02 * elastic
+
     def test_pressure_driven_is_the_inverse_of_strain_driven(self, kind):
         there, back = FoamTruth(kind, 1), FoamTruth(kind, 1)
         for elastic in (20.0, 60.0, 100.0, 50.0, 70.0):
