@@ -7,7 +7,7 @@ touched just before stay in doubt until they are calibrated.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from skin_host.layout import Layout, PadKind
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.drift import SETTLE_S
 from skin_host.processing.frame import PressureFrame
+from skin_host.processing.glimpses import Glimpses
 from skin_host.processing.intake import Intake, below_zero, lifted
 from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask, any_of
@@ -37,29 +38,11 @@ from skin_host.processing.rezero import (
 )
 from skin_host.processing.silent_zero import STILL_SHARE, SilentZero
 
-#: So many conversions show that something presses a taxel which is not valid, ...
-GLIMPSED = 3
-#: ... or has become it less than this ago: a touch may not be decided yet.
-DECIDED_NS = 500_000_000
 #: One reading inside the scale counts as so many at its end: a pad whose noise reaches inside in a
 #: tenth of its readings rests within 1.3 standard deviations of the end.
 INSIDE_WEIGHT = 9
 #: The byte at the end of the scale, to be found among those of a sweep.
 END_BYTE = bytes((END,))
-
-
-@dataclass(slots=True)
-class _Glimpse:
-    """The last readings of a board of which taxels are not valid, or were not just now.
-
-    Attributes:
-        units: float64[k, 192], the last k that were received of each taxel, the newest first, away
-            from its zero; -inf where it was far below zero, NaN where there are fewer.
-        until_ns: then its touches are decided.
-    """
-
-    units: NDArray[np.float64]
-    until_ns: int = 0
 
 
 class BoardZeros:
@@ -106,7 +89,7 @@ class BoardZeros:
         #: Boards that have neither sent nor been zeroed since they were held.
         self._awaited: set[int] = set()
         #: Boards of which taxels are not valid, or were not just now, as their zero is sought.
-        self._glimpses: dict[int, _Glimpse] = {}
+        self._glimpses = Glimpses()
         #: Triangles bool[16] of a board whose chips did not answer when they were last received,
         #: and whether any of these was missing from its last sweep.
         self._unanswered: dict[int, tuple[Mask, bool]] = {}
@@ -159,7 +142,7 @@ class BoardZeros:
             self.rezeros.pop(board, None)
             self._silent_zeros.pop(board, None)
             self._returned.forget(board)
-            self._glimpses.pop(board, None)
+            self._glimpses.forget(board)
             self._at_end.pop(board, None)
             self._pressed.pop(board, None)
         self.release(boards)
@@ -311,7 +294,7 @@ class BoardZeros:
             touched |= fitted & self._glimpsed(board)
         if self._calibration is None:
             return 0
-        self._glimpses.pop(board, None)
+        self._glimpses.forget(board)
         self._at_end.pop(board, None)
         if before is not None:
             touched |= before.unknown.reshape(TRIANGLES, PADS)
@@ -476,7 +459,7 @@ class BoardZeros:
 
     def _note_twice(self, sweep: Sweep, row: int) -> None:
         """Two boards send at an address: what both send is the zero of neither."""
-        self._glimpses.pop(sweep.board, None)
+        self._glimpses.forget(sweep.board)
         rezero = self.rezeros.get(sweep.board)
         if rezero is None:
             return
@@ -598,7 +581,8 @@ class BoardZeros:
     def _compare_chips(self, sweep: Sweep, row: int) -> None:
         """Keep chips that were not read for long from being valid until their drift is known."""
         here = np.repeat(self._ledger.present[row] & (self._ledger.error[row] == 0), PADS)
-        unknown, drifted_units = self._returned.step(sweep, here & ~self._ledger.far[row].ravel())
+        here &= ~self._ledger.far[row].ravel()
+        unknown, drifted_units = self._returned.step(sweep, here, self._ledger.now_ns)
         if drifted_units is not None and self._pipeline is not None:
             taxels = self._of(sweep.board).ravel()
             self._pipeline.catch_up(taxels[taxels >= 0], drifted_units[taxels >= 0])
@@ -635,7 +619,7 @@ class BoardZeros:
                 taxels = self._of(sweep.board).ravel()
                 self._last_touched[taxels[silent_zero.touched]] = True
             # What was read since is of the new zero.
-            self._glimpses.pop(sweep.board, None)
+            self._glimpses.forget(sweep.board)
             del self._silent_zeros[sweep.board]
             self.rezero(sweep.board)
             return
@@ -660,39 +644,24 @@ class BoardZeros:
 
     def _note_glimpse(self, sweep: Sweep, row: int) -> None:
         """Keep what a board sends while its taxels are not valid, and until their touches are
-        decided: whatever presses them meanwhile must not become a zero unnoticed.
+        decided.
         """
         rezero = self.rezeros.get(sweep.board)
         blind = sweep.board in self._silent_zeros
         blind |= rezero is not None and rezero.unsettled(sweep.t_ns) is not None
-        glimpse = self._glimpses.get(sweep.board)
-        own = self._layout.boards[sweep.board].settings
-        if glimpse is None:
-            if not blind:
-                return
-            longest = math.ceil(GLIMPSED * repeats_of(own.period_ms * 1e-3))
-            none = np.full((longest, TRIANGLES * PADS), np.nan)
-            glimpse = self._glimpses[sweep.board] = _Glimpse(none)
-        if blind:
-            glimpse.until_ns = sweep.t_ns + DECIDED_NS
-        elif not 0 <= glimpse.until_ns - sweep.t_ns <= DECIDED_NS:
-            del self._glimpses[sweep.board]
-            return
-        ledger = self._ledger
+        ledger, own = self._ledger, self._layout.boards[sweep.board].settings
         here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
         units = np.where(ledger.far[row], -np.inf, float(own.no_load) - sweep.raw).ravel()
-        glimpse.units[1:, here] = glimpse.units[:-1, here]
-        glimpse.units[0, here] = units[here]
+        period_s = own.period_ms * 1e-3
+        self._glimpses.note(sweep.board, units, here, sweep.t_ns, period_s, blind=blind)
 
     def _glimpsed(self, board: int) -> Mask:
         """Return taxels bool[16, 12] of a board that something presses by its last readings, while
         no touch could be decided.
         """
-        glimpse = self._glimpses.get(board)
         calibration, pipeline = self._calibration, self._pipeline
-        pressed = np.zeros((TRIANGLES, PADS), np.bool_)
-        if glimpse is None or calibration is None or pipeline is None:
-            return pressed
+        if board not in self._glimpses or calibration is None or pipeline is None:
+            return np.zeros((TRIANGLES, PADS), np.bool_)
         taxels = self._of(board).ravel()
         spread = np.maximum(calibration.spread, calibration.noise)[taxels]
         baseline = pipeline.baseline[taxels]
@@ -704,12 +673,9 @@ class BoardZeros:
             baseline = rezero.lowest()
             highest = baseline + STEADY_UNITS + error
         highest = np.maximum(highest, baseline + pipeline.enter[taxels])
-        fit = (taxels >= 0) & calibration.usable[taxels]
-        fit &= np.count_nonzero(~np.isnan(glimpse.units), axis=0) >= GLIMPSED
-        pressed[fit.reshape(pressed.shape)] = (
-            np.nanmedian(glimpse.units[:, fit], axis=0) > highest[fit]
-        )
-        return pressed
+        pressed = self._glimpses.pressed(board, highest)
+        pressed &= (taxels >= 0) & calibration.usable[taxels]
+        return pressed.reshape(TRIANGLES, PADS)
 
     def _note_below_zero(self, sweep: Sweep, row: int) -> None:
         """Detect pads whose zero was taken while something pressed that has lifted now."""

@@ -87,9 +87,9 @@ CALM_MEAN = 0.1
 NOISE_MEMORY_CONVERSIONS = 8
 #: Boards that send more seldom than this read a hand's fastest taps less than three times each.
 SLOW_S = 1.0 / (3.0 * FASTEST_HZ)
-#: Of their triangles a step is a press, or its end, where so many pads make a far one in its
-#: direction, and so many times as many as in the other. Ten pads that read what they like do that
-#: in one step of ten.
+#: Of their triangles a step is a press, or its end, where so many pads make one two thirds as far
+#: in its direction, and so many times as many as in the other: the pad that is pressed hardest
+#: may be alone. Ten pads that read what they like do that in one step of ten.
 TOGETHER_PADS = 3
 TOGETHER_RATIO = 4
 #: A pad has jumped lately while that mean is above this: for some 25 conversions.
@@ -195,6 +195,7 @@ class Liveness:
         self._jump = np.where(known, np.maximum(NOISY_UNITS, NOISY_SIGMAS * most), np.inf)
         #: Steps are whole units, at most 255.
         self._jump_units = np.minimum(np.floor(self._jump), 255.0).astype(np.uint8)
+        self._together_units = (2.0 / 3.0 * self._jump_units).astype(np.uint8)
         self._slow: Mask = period_s > SLOW_S
         self._any_slow = any_of(self._slow)
         #: Pads whose steps show what presses. A board takes the noise of the other off them.
@@ -531,7 +532,7 @@ class Liveness:
             if self._any_step_left:
                 jump = far & (self._step_left > 0) & (up ^ self._step_up)
                 if self._any_slow:
-                    jump &= ~self._moved_together(far, up)
+                    jump &= ~self._moved_together(far, size, up)
         here = None if whole else compared
         if jump is not None and any_of(jump):
             self._count_jumps(jump, size, here)
@@ -551,15 +552,15 @@ class Liveness:
             np.copyto(self._step_size, size, where=far)
             np.copyto(self._step_up, up, where=far)
 
-    def _moved_together(self, far: Mask, up: Mask) -> Mask:
-        """Return which far steps, bool[k, 12], most pads of a triangle that is read seldom make,
-        up or down.
+    def _moved_together(self, far: Mask, size: NDArray[np.uint8], up: Mask) -> Mask:
+        """Return which far steps, bool[k, 12], most pads of a triangle that is read seldom share,
+        up or down; of steps of so many units.
         """
-        felt = far & self._feels
-        rise = count_of(felt & up)[:, None]
-        fall = count_of(felt)[:, None] - rise
+        moved = (size > self._together_units) & self._feels
+        rise = count_of(moved & up)[:, None]
+        fall = count_of(moved)[:, None] - rise
         same, other = np.where(up, rise, fall), np.where(up, fall, rise)
-        found: Mask = felt & self._slow[:, None]
+        found: Mask = far & self._feels & self._slow[:, None]
         found &= (same >= TOGETHER_PADS) & (same >= TOGETHER_RATIO * other)
         return found
 

@@ -16,7 +16,7 @@ from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.silent_zero import DRIFT_S, SilentZero
 
 _BITS = 1 << np.arange(TRIANGLES)
-_READ_NS = -1
+_KNOWN_NS = -1
 _DRIFT_NS = round(DRIFT_S * 1e9)
 
 
@@ -33,18 +33,20 @@ class ReturnedChips:
     def __init__(self, fitted: dict[int, Mask]) -> None:
         self._fitted = fitted
         self._all = {board: int(those @ _BITS) for board, those in fitted.items()}
-        #: By board since when (ns) each of its triangles, int64[16], has not been read, where any
-        #: is not; `_READ_NS` of the others.
-        self._unread: dict[int, NDArray[np.int64]] = {}
+        #: By board since when (ns) it is not known what each of its triangles, int64[16], drifts
+        #: by, where it is not of any; `_KNOWN_NS` of the others.
+        self._since_ns: dict[int, NDArray[np.int64]] = {}
         self.compared: dict[int, tuple[Mask, SilentZero]] = {}
 
     def go_on(self, before: "ReturnedChips") -> None:
         """Take over the state of a predecessor for the same boards."""
-        self._unread, self.compared = before._unread, before.compared
+        self._since_ns, self.compared = before._since_ns, before.compared
 
     def watches(self, sweep: Sweep) -> bool:
-        """Return whether `note` must see a sweep, by what was received: some chip is not read."""
-        return bool(self._all[sweep.board] & ~sweep.present) or sweep.board in self._unread
+        """Return whether `note` must see a sweep, by what was received: some chip is not read, or
+        was not.
+        """
+        return bool(self._all[sweep.board] & ~sweep.present) or sweep.board in self._since_ns
 
     def note(self, board: int, read: Mask, now_ns: int) -> tuple[Mask, float] | None:
         """Take in which triangles of a board were read in a sweep.
@@ -55,27 +57,37 @@ class ReturnedChips:
             now_ns: time of the sweep.
 
         Returns:
-            Triangles bool[16] that are read again after so long that their zeros may have drifted,
-            and for how long they were not (s); None if there are none.
+            Triangles bool[16] that are to be compared from now on, as they are read again after so
+            long that their zeros may have drifted, and for how long they were not (s); None if
+            there are none, or they are being compared.
         """
-        since_ns = self._unread.pop(board, None)
+        since_ns = self._since_ns.pop(board, None)
         if since_ns is None:
-            since_ns = np.full(TRIANGLES, _READ_NS, np.int64)
-        back = read & (since_ns != _READ_NS) & (now_ns - since_ns > _DRIFT_NS)
-        lost = self._fitted[board] & ~read
-        if any_of(lost):
-            lost_ns = np.where(since_ns == _READ_NS, now_ns, since_ns)
-            self._unread[board] = np.where(lost, lost_ns, _READ_NS)
+            since_ns = np.full(TRIANGLES, _KNOWN_NS, np.int64)
+        since_ns[self._fitted[board] & ~read & (since_ns == _KNOWN_NS)] = now_ns
+        since_ns[read & (now_ns - since_ns <= _DRIFT_NS)] = _KNOWN_NS
+        unknown = since_ns != _KNOWN_NS
+        if not any_of(unknown):
+            return None
+        self._since_ns[board] = since_ns
+        back = read & unknown
+        if board in self.compared:
+            back &= ~self.compared[board][0]
         if not any_of(back):
             return None
+        # A plug that gets contact flickers: what is compared already begins again with the others.
+        back = read & unknown
         return back, float((now_ns - since_ns[back]).max()) * 1e-9
 
-    def step(self, sweep: Sweep, here: Mask) -> tuple[Mask, NDArray[np.float64] | None]:
+    def step(
+        self, sweep: Sweep, here: Mask, now_ns: int
+    ) -> tuple[Mask, NDArray[np.float64] | None]:
         """Compare a sweep of a board of which some triangles are compared.
 
         Args:
             sweep: it.
             here: bool[192], its pads that were received and are readings.
+            now_ns: time of the sweep.
 
         Returns:
             The triangles bool[16] that are not known yet, and what each pad [192] has drifted by in
@@ -86,11 +98,17 @@ class ReturnedChips:
         if not comparison.decided:
             return triangles, None
         del self.compared[sweep.board]
+        known = triangles & np.any(comparison.received.reshape(TRIANGLES, -1), axis=1)
+        since_ns = self._since_ns.get(sweep.board)
+        if since_ns is not None:
+            read = np.any(here.reshape(TRIANGLES, -1), axis=1)
+            since_ns[known] = np.where(read[known], _KNOWN_NS, now_ns)
         drifted_units = comparison.drifted_units()
         if drifted_units is not None:
-            drifted_units[~np.repeat(triangles, len(here) // TRIANGLES)] = 0.0
-        return np.zeros_like(triangles), drifted_units
+            drifted_units[~np.repeat(known, len(here) // TRIANGLES)] = 0.0
+        return triangles & ~known, drifted_units
 
     def forget(self, board: int) -> None:
         """Compare no triangles of a board any more: its zero is sought, or was measured."""
         self.compared.pop(board, None)
+        self._since_ns.pop(board, None)

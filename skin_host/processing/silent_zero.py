@@ -204,6 +204,11 @@ class SilentZero:
         return None
 
     @property
+    def received(self) -> Mask:
+        """Return the taxels bool[n] that were received often enough to be compared."""
+        return self._count >= FEWEST
+
+    @property
     def _drifts(self) -> bool:
         """Whether pads may have drifted so much together that it counts where they rest now."""
         return self.unseen_s > DRIFT_S
@@ -214,7 +219,7 @@ class SilentZero:
 
         Each pad that reads no more than drift may leave takes its own reading for it.
         """
-        received = self._count >= FEWEST
+        received = self.received
         seen = self._known & self._pressure & received
         if not self._drifts or self.at_start or np.count_nonzero(seen) < REFERENCES:
             return None

@@ -45,6 +45,19 @@ def test_what_drifted_while_a_chip_was_not_read_is_no_touch(warmer_c: float) -> 
     assert np.count_nonzero(bench.valid[PART]) == 12
 
 
+def test_a_plug_whose_contact_flickers_as_it_comes_back_is_compared_all_the_same() -> None:
+    bench = unread(2.0)
+    for _ in range(5):
+        bench.run(0.15)
+        mend = bench.inject("chip_gone", board="palm", triangle=0)
+        bench.run(0.5)
+        assert not bench.valid[PART].any()
+        mend()
+    bench.run(5.0)
+    assert np.count_nonzero(bench.valid[PART]) == 12
+    assert not bench.touched[PART].any()
+
+
 def test_what_came_on_some_pads_meanwhile_is_a_touch_of_these() -> None:
     press = Probe(
         part=PART,
