@@ -20,7 +20,7 @@ from skin_host.processing.calibration import Calibration
 from skin_host.processing.drift import SETTLE_S
 from skin_host.processing.frame import PressureFrame
 from skin_host.processing.glimpses import Glimpses
-from skin_host.processing.intake import Intake, below_zero, lifted
+from skin_host.processing.intake import Intake, below_zero
 from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pipeline import Pipeline
@@ -144,7 +144,7 @@ class BoardZeros:
             self._returned.forget(board)
             self._glimpses.forget(board)
             self._at_end.pop(board, None)
-            self._pressed.pop(board, None)
+            self._forget_pressed(board)
         self.release(boards)
         zeroed = self._layout.taxels_of(boards)
         self._last_touched[zeroed] = self._touched[zeroed]
@@ -438,9 +438,10 @@ class BoardZeros:
         it before and has not lifted.
         """
         pressed = touched.ravel().copy()
-        before = self._pressed.pop(board, None)
+        before = self._pressed.get(board)
         if before is not None:
             pressed |= before.pressed
+        self._forget_pressed(board)
         if not any_of(pressed):
             return
         own = self._layout.boards[board].settings
@@ -449,11 +450,17 @@ class BoardZeros:
             noise = self._calibration.noise[self._of(board).ravel()]
         repeats = repeats_of(own.period_ms * 1e-3)
         self._pressed[board] = PressedZero(pressed, float(own.no_load), noise, repeats)
+        self._intake.zeroed_pressed[self._ledger.row[board]] = pressed.reshape(TRIANGLES, PADS)
+
+    def _forget_pressed(self, board: int) -> None:
+        self._pressed.pop(board, None)
+        self._intake.zeroed_pressed.pop(self._ledger.row[board], None)
 
     def _note_lifted(self, sweep: Sweep, row: int, pressed_zero: PressedZero) -> None:
         """See what of that which pressed a board when it was zeroed has lifted."""
         ledger = self._ledger
-        here = (ledger.error[row] == 0) & ledger.present[row] & ~lifted(sweep.raw, ledger.far[row])
+        here = (ledger.error[row] == 0) & ledger.present[row]
+        here &= ~self._intake.reads_another(row, sweep.raw)
         if pressed_zero.step(sweep.raw.ravel(), np.repeat(here, PADS)):
             self._last_touched[self._of(sweep.board).ravel()[pressed_zero.lifted]] = False
 
@@ -565,8 +572,7 @@ class BoardZeros:
     def _note_unread(self, sweep: Sweep, row: int) -> None:
         """See which chips are not read, and compare those that are again after a long time."""
         read = self._ledger.present[row] & (self._ledger.error[row] == 0)
-        if row in self._ledger.twice:
-            read = np.zeros_like(read)
+        read &= (row not in self._ledger.twice) & ~self._intake.reads_another(row, sweep.raw)
         back = self._returned.note(sweep.board, read, self._ledger.now_ns)
         rezero = self.rezeros.get(sweep.board)
         sought = sweep.board in self._silent_zeros or (rezero is not None and rezero.seeks_all)
@@ -717,7 +723,8 @@ class BoardZeros:
         if self._calibration is None:
             return
         far = self._ledger.far[row]
-        here = (self._ledger.error[row] == 0) & self._ledger.present[row] & ~lifted(sweep.raw, far)
+        here = (self._ledger.error[row] == 0) & self._ledger.present[row]
+        here &= ~self._intake.reads_another(row, sweep.raw)
         taxels = self._of(sweep.board)
         pads = here[:, None] & ~far & (taxels >= 0) & self._calibration.usable[taxels]
         at_end = pads & (sweep.raw == END)

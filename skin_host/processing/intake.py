@@ -114,6 +114,8 @@ class Intake:
         veto: bool[16, 12] by row of the board: taxels that are invalid for a reason that the
             bytes do not show.
         touched: bool[16, 12] by row of the board: pads that are touched, where any is.
+        zeroed_pressed: bool[16, 12] by row of the board: pads that were pressed when it was zeroed.
+            Once that lifts they read far below zero, and show no other chip.
         far_presses: which of the pads that are far out of range are pressed.
     """
 
@@ -132,6 +134,7 @@ class Intake:
         self._unpressable = np.array([unpressable(layout, board, full_ff) for board in boards])
         self.veto: dict[int, Mask] = {}
         self.touched: dict[int, Mask] = {}
+        self.zeroed_pressed: dict[int, Mask] = {}
         self.far_presses = FarPresses(layout, boards)
         n = len(boards)
         # The last sweep of each board, by its row.
@@ -213,6 +216,7 @@ class Intake:
         self.liveness = before.liveness
         self.veto = before.veto
         self.touched = before.touched
+        self.zeroed_pressed = before.zeroed_pressed
         self.far_presses = before.far_presses
         self._raw, self._bytes = before._raw, before._bytes
         self._present, self._received = before._present, before._received
@@ -404,7 +408,7 @@ class Intake:
     def _pressed_far(self, row: int, sweep: Sweep) -> Mask:
         """Return pads bool[16, 12] of a sweep that are pressed far out of their range."""
         ledger, doubted = self._ledger, self.liveness.doubted
-        trusted = np.repeat(~lifted(sweep.raw, ledger.far[row])[:, None], PADS, axis=1)
+        trusted = np.repeat(~self.reads_another(row, sweep.raw)[:, None], PADS, axis=1)
         if doubted is not None:
             trusted &= ~doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
         return self.far_presses.step(
@@ -417,14 +421,31 @@ class Intake:
             ledger.now_ns,
         )
 
+    def reads_another(self, row: int, raw: NDArray[np.uint8]) -> Mask:
+        """Return the triangles bool[16] of a board that read like another chip, see `lifted`.
+
+        Args:
+            row: of the board; the ledger has noted its sweep.
+            raw: uint8[16, 12], the bytes of that.
+        """
+        return lifted(raw, self._unexplained(row))
+
+    def _unexplained(self, row: int) -> Mask:
+        """Return pads bool[16, 12] of a board that are far out of range, and were not pressed when
+        it was zeroed.
+        """
+        far: Mask = self._ledger.far[row]
+        pressed = self.zeroed_pressed.get(row)
+        return far if pressed is None else far & ~pressed
+
     def _flagged(self, row: int, raw: NDArray[np.uint8], pressed: Mask) -> Mask:
         """Return triangles bool[16] of a sweep with status words that were received, answer, and
         are in their range but for the pads bool[16, 12] that are pressed beyond it.
         """
         ledger = self._ledger
-        far = ledger.far[row]
-        another = lifted(raw, far)
+        another = self.reads_another(row, raw)
         if any_of(self._unpressable[row]):
+            far = self._unexplained(row)
             another |= self._unpressable[row] & (count_of(far & ~pressed) >= FAR_PADS)
         here: Mask = ledger.present[row] & (ledger.error[row] == 0)
         another &= here

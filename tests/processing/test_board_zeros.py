@@ -157,6 +157,33 @@ def test_whether_a_pad_stays_below_zero_shows_in_the_sweeps_that_came(
     assert hand.in_doubt == doubted
 
 
+def test_pads_that_lift_after_a_zero_under_a_press_show_no_other_chip(hand: Hand) -> None:
+    """The others of their triangle were not valid until all were pressed again, and their zeros
+    did not follow the temperature meanwhile.
+    """
+    frames: list[PressureFrame] = []
+    hand.deliver = lambda output: frames.extend(output.frames)
+    pressed = {f"p{pad}": 200 for pad in (1, 2, 3, 4, 5)}
+    hand.send(40, **pressed)
+    hand.engine.zeros.rezero(0)
+    hand.send(60)
+    hand.send(60, **dict.fromkeys(pressed, FAR_BELOW))
+    assert hand.in_doubt == [1, 2, 3, 4, 5]
+    assert np.flatnonzero(~frames[-1].valid[:12]).tolist() == [1, 2, 3, 4, 5]
+
+
+def test_pads_that_lift_and_were_not_pressed_when_their_board_was_zeroed_are_of_another_chip(
+    hand: Hand,
+) -> None:
+    frames: list[PressureFrame] = []
+    hand.deliver = lambda output: frames.extend(output.frames)
+    hand.send(40, p1=200)
+    hand.engine.zeros.rezero(0)
+    hand.send(60)
+    hand.send(10, p1=FAR_BELOW, p2=FAR_BELOW, p3=FAR_BELOW)
+    assert not frames[-1].valid[:12].any()
+
+
 def test_a_pad_that_rests_at_the_end_of_its_scale_was_pressed_when_its_board_was_zeroed(
     hand: Hand,
 ) -> None:
