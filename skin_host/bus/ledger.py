@@ -353,6 +353,13 @@ class BoardLedger:
         oldest = n % INTERVALS if n > INTERVALS else 0
         return np.array([*intervals[oldest:], *intervals[:oldest]][:n], np.int64)
 
+    def answered(self, row: int) -> NDArray[np.bool_]:
+        """Return the triangles bool[16] of a board whose last sweep came without an error in its
+        status word.
+        """
+        found: NDArray[np.bool_] = self.present[row] & (self.error[row] == 0)
+        return found
+
     def regular_period_ns(self, row: int) -> float | None:
         """Return the median of a board's last intervals, or None if they are few or irregular.
 

@@ -424,7 +424,7 @@ class Link:
         """
         known, ledger = self._engine.layout.boards[board].settings, self._engine.ledger
         record, row = self.boards[known.bus].records[known.address], ledger.row[board]
-        answering = ledger.present[row] & (ledger.error[row] == 0)
+        answering = ledger.answered(row)
         if ledger.is_silent(row) or not (ledger.since_set_up(row) and answering.any()):
             return 0
         return record.configurations

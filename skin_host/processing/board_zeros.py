@@ -52,7 +52,8 @@ class BoardZeros:
         layout: the skin.
         boards: indices of the boards.
         ledger: of these boards.
-        intake: of their sweeps; it is given which taxels are not valid, and which are touched.
+        intake: of their sweeps; it is given which taxels are not valid, which are touched, and
+            which were pressed when their board was zeroed.
         on_rezero: called with the index of each board that has a new zero, and `believed`, see
             `rezero`.
 
@@ -459,8 +460,7 @@ class BoardZeros:
     def _note_lifted(self, sweep: Sweep, row: int, pressed_zero: PressedZero) -> None:
         """See what of that which pressed a board when it was zeroed has lifted."""
         ledger = self._ledger
-        here = (ledger.error[row] == 0) & ledger.present[row]
-        here &= ~self._intake.reads_another(row, sweep.raw)
+        here = ledger.answered(row) & ~self._intake.reads_another(row, sweep.raw)
         if pressed_zero.step(sweep.raw.ravel(), np.repeat(here, PADS)):
             self._last_touched[self._of(sweep.board).ravel()[pressed_zero.lifted]] = False
 
@@ -571,8 +571,8 @@ class BoardZeros:
 
     def _note_unread(self, sweep: Sweep, row: int) -> None:
         """See which chips are not read, and compare those that are again after a long time."""
-        read = self._ledger.present[row] & (self._ledger.error[row] == 0)
-        read &= (row not in self._ledger.twice) & ~self._intake.reads_another(row, sweep.raw)
+        read = self._ledger.answered(row) & ~self._intake.reads_another(row, sweep.raw)
+        read &= row not in self._ledger.twice
         back = self._returned.note(sweep.board, read, self._ledger.now_ns)
         rezero = self.rezeros.get(sweep.board)
         sought = sweep.board in self._silent_zeros or (rezero is not None and rezero.seeks_all)
@@ -586,7 +586,7 @@ class BoardZeros:
 
     def _compare_chips(self, sweep: Sweep, row: int) -> None:
         """Keep chips that were not read for long from being valid until their drift is known."""
-        here = np.repeat(self._ledger.present[row] & (self._ledger.error[row] == 0), PADS)
+        here = np.repeat(self._ledger.answered(row), PADS)
         here &= ~self._ledger.far[row].ravel()
         unknown, drifted_units = self._returned.step(sweep, here, self._ledger.now_ns)
         if drifted_units is not None and self._pipeline is not None:
@@ -615,7 +615,7 @@ class BoardZeros:
             del self._silent_zeros[sweep.board]
             return
         ledger = self._ledger
-        here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
+        here = np.repeat(ledger.answered(row), PADS)
         zeroed = silent_zero.step(sweep.raw.ravel(), here & ~ledger.far[row].ravel(), sweep.t_ns)
         if zeroed:
             if silent_zero.at_start:
@@ -656,7 +656,7 @@ class BoardZeros:
         blind = sweep.board in self._silent_zeros
         blind |= rezero is not None and rezero.unsettled(sweep.t_ns) is not None
         ledger, own = self._ledger, self._layout.boards[sweep.board].settings
-        here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
+        here = np.repeat(ledger.answered(row), PADS)
         units = np.where(ledger.far[row], -np.inf, float(own.no_load) - sweep.raw).ravel()
         period_s = own.period_ms * 1e-3
         self._glimpses.note(sweep.board, units, here, sweep.t_ns, period_s, blind=blind)
@@ -685,7 +685,7 @@ class BoardZeros:
 
     def _note_below_zero(self, sweep: Sweep, row: int) -> None:
         """Detect pads whose zero was taken while something pressed that has lifted now."""
-        answered = (self._ledger.error[row] == 0) & self._ledger.present[row]
+        answered = self._ledger.answered(row)
         below = below_zero(sweep.raw, self._ledger.far[row] & answered[:, None])
         before = self._below.pop(sweep.board, None)
         rezero = self.rezeros.get(sweep.board)
@@ -723,8 +723,7 @@ class BoardZeros:
         if self._calibration is None:
             return
         far = self._ledger.far[row]
-        here = (self._ledger.error[row] == 0) & self._ledger.present[row]
-        here &= ~self._intake.reads_another(row, sweep.raw)
+        here = self._ledger.answered(row) & ~self._intake.reads_another(row, sweep.raw)
         taxels = self._of(sweep.board)
         pads = here[:, None] & ~far & (taxels >= 0) & self._calibration.usable[taxels]
         at_end = pads & (sweep.raw == END)
@@ -754,7 +753,7 @@ class BoardZeros:
         if self._pipeline is None or self._calibration is None:
             return
         ledger = self._ledger
-        here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
+        here = np.repeat(ledger.answered(row), PADS)
         ledger.rezeros[row] += not rezero.begun
         far, touched = ledger.far[row].ravel(), row in self._intake.touched
         if rezero.step(sweep.raw.ravel(), here, far, sweep.t_ns, touched):

@@ -447,7 +447,7 @@ class Intake:
         if any_of(self._unpressable[row]):
             far = self._unexplained(row)
             another |= self._unpressable[row] & (count_of(far & ~pressed) >= FAR_PADS)
-        here: Mask = ledger.present[row] & (ledger.error[row] == 0)
+        here = ledger.answered(row)
         another &= here
         now_ns, untaken_ns = ledger.now_ns, self._untaken_ns[row]
         if any_of(another):

@@ -62,21 +62,22 @@ class ReturnedChips:
             there are none, or they are being compared.
         """
         since_ns = self._since_ns.pop(board, None)
+        lost = self._fitted[board] & ~read
         if since_ns is None:
+            if not any_of(lost):
+                return None
             since_ns = np.full(TRIANGLES, _KNOWN_NS, np.int64)
-        since_ns[self._fitted[board] & ~read & (since_ns == _KNOWN_NS)] = now_ns
+        since_ns[lost & (since_ns == _KNOWN_NS)] = now_ns
         since_ns[read & (now_ns - since_ns <= _DRIFT_NS)] = _KNOWN_NS
         unknown = since_ns != _KNOWN_NS
         if not any_of(unknown):
             return None
         self._since_ns[board] = since_ns
         back = read & unknown
-        if board in self.compared:
-            back &= ~self.compared[board][0]
-        if not any_of(back):
-            return None
         # A plug that gets contact flickers: what is compared already begins again with the others.
-        back = read & unknown
+        others = back & ~self.compared[board][0] if board in self.compared else back
+        if not any_of(others):
+            return None
         return back, float((now_ns - since_ns[back]).max()) * 1e-9
 
     def step(

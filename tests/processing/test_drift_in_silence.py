@@ -43,10 +43,7 @@ def away(
 def test_what_drifted_while_a_board_was_away_is_no_touch(before_c: float, warmer_c: float) -> None:
     """Most pads would be touched, and stay it, because a touch hides drift."""
     bench = away(warmer_c, before_c=before_c)
-    touched = []
-    for _ in range(200):
-        bench.run(0.05)
-        touched.append(np.count_nonzero(bench.touched[PART]))
+    touched = bench.touched_meanwhile(PART, 10.0)
     assert max(touched) <= 1
     assert touched[-1] == 0
     assert np.count_nonzero(bench.valid[PART]) > 90

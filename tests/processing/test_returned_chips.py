@@ -37,10 +37,7 @@ def unread(
 def test_what_drifted_while_a_chip_was_not_read_is_no_touch(warmer_c: float) -> None:
     """All pads would be touched, and stay it, because a touch hides drift."""
     bench = unread(warmer_c)
-    touched = []
-    for _ in range(200):
-        bench.run(0.05)
-        touched.append(np.count_nonzero(bench.touched[PART]))
+    touched = bench.touched_meanwhile(PART, 10.0)
     assert max(touched) == 0
     assert np.count_nonzero(bench.valid[PART]) == 12
 

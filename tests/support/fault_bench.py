@@ -89,6 +89,14 @@ class FaultBench:
             if round(self.t_s / TICK_S) % LOOK_EVERY == 0:
                 self._look()
 
+    def touched_meanwhile(self, part: str, seconds: float) -> list[int]:
+        """Let time pass; return how many taxels of a part were touched after each step of it."""
+        found = []
+        for _ in range(round(seconds / TICK_S)):
+            self.run(TICK_S)
+            found.append(int(np.count_nonzero(self.touched[part])))
+        return found
+
     def _note(self, output: Output) -> None:
         self.health.note(output)
         for sweep in output.sweeps:

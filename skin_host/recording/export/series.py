@@ -246,8 +246,8 @@ def read_frames(
     """Process a recording of CAN frames with the pipeline, as `skin replay` does. It may have no
     frames of pressure, see `Series.require_frames`.
 
-    `warn` is called with the boards of which little or nothing counted because they send much more
-    slowly than configured.
+    `warn` is called with the boards of which little or nothing counted because they send at
+    another period than configured.
 
     Raises:
         LogError: it cannot be read, or holds nothing of this skin.
