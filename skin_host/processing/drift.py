@@ -1,19 +1,21 @@
 """Baselines that follow drift (paper, section V-C).
 
 Once a window each taxel is in one of four states. Its baseline follows what the untouched
-taxels of its part have in common, and a part of what its own reading has beyond that:
+taxels of its part have in common, and a part of what its own reading has beyond that. A slow rise
+is followed up to `SLOW_UNITS_PER_S`:
 
 | state | when | own reading |
 |---|---|---|
 | idle | nothing touches the part | by the rule |
-| disturbed | something touches the part elsewhere or loads it; or fallen | `ALONE_UNITS_PER_S` |
-| touched | touched, not received, or returned | a slow rise, up to `SLOW_UNITS_PER_S` |
+| disturbed | something touches or loads the part; or fallen | a slow rise, or `ALONE_UNITS_PER_S` |
+| touched | touched, not received, or returned | a slow rise |
 | recovering | `SETTLE_S` after a touch; or fallen for so long | by the rule; the whole fall |
 
 | in common | when | is followed |
 |---|---|---|
 | drift | the part moves alike, and rises by less than `QUICK_UNITS_PER_S` | at once |
 | perhaps a load | otherwise | up to `SLOW_UNITS_PER_S` |
+| shown by few | `REFERENCES` are not untouched | a slow rise that all of these show |
 
 What the readings can distinguish, and what they cannot:
 
@@ -47,8 +49,11 @@ from skin_host.processing.thermal import SMOOTHING_S, ThermalReference
 
 Array = NDArray[np.float64]
 
-#: Fewer untouched taxels than this do not represent the others.
+#: Fewer untouched taxels than this do not represent the others, ...
 REFERENCES = 4
+#: ... but for a slow rise that all of them show, if they are this share of the part: the pads of a
+#: fingertip that is in use are seldom free, and it becomes warm.
+FEW_SHARE = 1.0 / 6.0
 #: A part moves alike when this share of its received taxels stays within the tolerance of their
 #: median. On an evenly pressed insole 52 to 75 % do, on drifting pads with noise of 1 unit 98 %.
 ALIKE_SHARE = 0.8
@@ -61,7 +66,7 @@ CONVERSIONS = 20.0
 QUICK_UNITS_PER_S = 0.4
 #: Drift that a load may hide: 10 degrees in 10 minutes are 0.008.
 SLOW_UNITS_PER_S = 0.01
-#: A bulge of any depth that lasts for ten minutes does not become a touch.
+#: A bulge of any depth that lasts for ten minutes does not become a touch. What rises is no bulge.
 ALONE_UNITS_PER_S = 0.0005
 #: Bulges without a touch are shorter, and so are the pauses of a flickering touch.
 SETTLE_S = 5.0
@@ -246,13 +251,15 @@ class BaselineTracker:
         common = self._common(units, shows, int(np.count_nonzero(received)), share, dt_s)
         self.shared_units = common if forecast is None else common + forecast
         if lifted is None and self._is_calm(units, common, hidden, dt_s):
-            change = self._own(units - common, self._settings.rate_units_per_s * dt_s, dt_s)
+            rate = self._settings.rate_units_per_s * dt_s
+            change = self._own(units - common, rate, rate, dt_s)
             self._move(change + common, common, forecast)
             return None
         state = self._states(units, touched | self.returned, hidden, recovering, dt_s)
         held = recovering & ~self._remains(units, hidden, dt_s)
-        state[held | (free & (self._loaded_s > 0.0))] = State.DISTURBED
-        change = self._followed(units, common, state, dt_s)
+        given_back = free & (self._loaded_s > 0.0)
+        state[held | given_back] = State.DISTURBED
+        change = self._followed(units, common, state, shows & ~given_back, dt_s)
         fallen = self._fallen_s >= SETTLE_S
         change[fallen] = units[fallen]
         if lifted is not None:
@@ -375,8 +382,10 @@ class BaselineTracker:
         """
         self._loaded = False
         reading = units[free]
+        limit = SLOW_UNITS_PER_S * dt_s
         if len(reading) < REFERENCES:
-            return 0.0
+            enough = len(reading) >= max(FEW_SHARE * received, 2.0)
+            return min(max(float(reading.min()), 0.0), limit) if enough else 0.0
         median = _median(reading)
         # Where noise has made the last window differ, this one has the drift of both.
         self._loaded = median > QUICK_UNITS_PER_S * dt_s * (2.0 if self._behind else 1.0)
@@ -388,7 +397,6 @@ class BaselineTracker:
         reading = reading[reading > FALLEN_UNITS]
         if len(reading) < REFERENCES:
             return 0.0
-        limit = SLOW_UNITS_PER_S * dt_s
         return min(max(_median(reading), -limit), limit)
 
     def _is_calm(self, units: Array, common: float, hidden: Mask, dt_s: float) -> bool:
@@ -483,9 +491,16 @@ class BaselineTracker:
         self._fallen_s *= fallen & self._usable & ~hidden & ~recovering
         return state
 
-    def _followed(self, units: Array, common: float, state: NDArray[np.int8], dt_s: float) -> Array:
+    def _followed(
+        self, units: Array, common: float, state: NDArray[np.int8], shows: Mask, dt_s: float
+    ) -> Array:
         """Return the change of each baseline: the common change, and what a reading has beyond
         it.
+
+        Args:
+            units, common, dt_s: see `step` and `_common`.
+            state: of each taxel, int8[n].
+            shows: which, bool[n], have not been touched of late, so that a slow rise is their own.
         """
         # An undisturbed taxel that differs from the others moves no farther than its reading.
         differs = (np.abs(units - common) > TOLERANCE_UNITS) & (
@@ -493,21 +508,26 @@ class BaselineTracker:
         )
         shared = np.full(len(units), common)
         np.clip(units, min(common, 0.0), max(common, 0.0), out=shared, where=differs)
-        change = self._own(units - shared, self._own_rate[state] * dt_s, dt_s)
+        beyond = units - shared
+        limit = self._own_rate[state] * dt_s
+        slow = min(SLOW_UNITS_PER_S, self._settings.rate_units_per_s) * dt_s
+        # What noise may be is followed as slowly up as down: it would lift the baseline otherwise.
+        risen = shows & (beyond > TOLERANCE_UNITS) & (not self._loaded)
+        change = self._own(beyond, np.fmax(limit, slow * risen), limit, dt_s)
         change += shared
         return change
 
-    def _own(self, beyond: Array, limit: Array | float, dt_s: float) -> Array:
-        """Return the change by the rule, within a limit, for what readings have beyond the common
-        change.
+    def _own(self, beyond: Array, rise: Array | float, fall: Array | float, dt_s: float) -> Array:
+        """Return the change by the rule, within its limits, for what readings have beyond the
+        common change.
         """
         settings = self._settings
         if settings.rule == "paper":
             change = paper_step(beyond, dt_s, settings.rate_units_per_s, settings.dead_band_units)
         else:
             change = proportional_step(beyond, dt_s, settings.gain_per_s)
-        np.fmin(change, limit, out=change)
-        np.fmax(change, np.negative(limit), out=change)
+        np.fmin(change, rise, out=change)
+        np.fmax(change, np.negative(fall), out=change)
         return change
 
 

@@ -545,6 +545,57 @@ def test_four_untouched_taxels_stand_for_the_part_and_three_do_not(free, moved):
     assert bool(track.baseline[-1] > 0.1) is moved
 
 
+@pytest.mark.parametrize(("free", "moved"), [(1, False), (2, True), (3, True)])
+def test_a_slow_rise_of_the_few_free_pads_of_a_fingertip_is_drift_of_them_all(free, moved):
+    """It is in use all the time, and becomes warm by a degree a minute."""
+    track = fingertip()
+    touched = np.arange(12) >= free
+    for second in range(240):
+        units = 0.008 * (second + 1) + np.where(touched, 30.0, 0.0) - track.baseline
+        track.step(units, touched, touched & False, 1.0)
+    assert bool(np.all(track.baseline > 1.8)) is moved
+
+
+@pytest.mark.parametrize("shown", [[0.02, -0.5, 0.02], [-0.5, -0.5, -0.5]])
+def test_what_not_all_free_pads_of_a_fingertip_rise_by_may_be_a_bulge_and_moves_no_touched_one(
+    shown,
+):
+    track = fingertip()
+    touched = np.arange(12) >= 3
+    for _ in range(60):
+        units = np.concatenate([shown, np.full(9, 30.0)])
+        track.step(units, touched, touched & False, 1.0)
+    assert track.baseline[3:] == pytest.approx(0.0, abs=1e-9)
+
+
+def fingertip():
+    part = np.zeros(12, np.int32)
+    return BaselineTracker(np.zeros(12), part == 0, part, part > 0, Drift())
+
+
+def test_pads_beside_a_touch_that_drift_more_than_the_others_are_followed():
+    """As those of a palm do, beside fingers of thinner foam."""
+    track = tracker()
+    touched, more = np.arange(N) < 3, np.arange(N) >= 18
+    rng = np.random.default_rng(6)
+    for second in range(240):
+        drifted = np.where(more, 0.014, 0.006) * (second + 1)
+        units = drifted + np.where(touched, 20.0, 0.0) - track.baseline + rng.normal(0.0, 0.1, N)
+        track.step(units, touched, NOBODY, 1.0)
+    assert (drifted - track.baseline)[more].max() < 1.0
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.2])
+def test_noise_beside_a_touch_does_not_lift_the_baselines(noise):
+    track = tracker()
+    touched = np.arange(N) < 3
+    rng = np.random.default_rng(7)
+    for _ in range(1200):
+        units = rng.normal(0.0, noise, N) + np.where(touched, 20.0, 0.0) - track.baseline
+        track.step(units, touched, NOBODY, 1.0)
+    assert np.abs(track.baseline[3:]).max() < 0.3
+
+
 def test_a_part_moves_alike_when_four_fifths_of_its_taxels_do():
     def moves(alike):
         track = tracker()

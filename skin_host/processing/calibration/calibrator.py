@@ -65,7 +65,7 @@ SHARED_CORRELATION = 0.8
 COMMON_UNITS = 1.0
 DRIFT_UNITS_PER_S = 0.1
 COMMON_SHARE = 0.5
-#: A pad moves like the mean if their correlation is beyond so many standard errors.
+#: A pad moves like the others if its correlation with their sum is beyond so many standard errors.
 ALIKE_ERRORS = 2.0
 #: A taxel that rests this much nearer to pressure than its triangle and its part was pressed, if
 #: its noise does not explain it.
@@ -460,8 +460,11 @@ class Calibrator:
             limit = max(COMMON_UNITS, STEADY_ERRORS * error, DRIFT_UNITS_PER_S * passed_s)
             if np.ptp(shared.reshape(-1, JOINED).mean(axis=1)) <= limit:
                 continue
-            likeness = each @ shared / np.sqrt(np.sum(each**2, axis=1) * np.sum(shared**2))
-            alike = likeness > ALIKE_ERRORS / np.sqrt(number)
+            # Each weighs the same, and none is compared with itself.
+            each /= np.linalg.norm(each, axis=1, keepdims=True)
+            others = each.sum(axis=0) - each
+            likeness = np.sum(each * others, axis=1)
+            alike = likeness > ALIKE_ERRORS / np.sqrt(number) * np.linalg.norm(others, axis=1)
             found[pads] = alike & (alike.mean() >= COMMON_SHARE)
         return found
 

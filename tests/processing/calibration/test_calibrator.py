@@ -587,6 +587,19 @@ def test_pads_beside_a_press_that_ends_during_a_calibration_were_not_touched():
         assert not touched[~pressed].any()
 
 
+def test_pads_at_rest_do_not_move_like_the_one_beside_them_that_was_touched_for_a_moment():
+    """All others of the part are pressed for long, which is no evidence about these four."""
+    pressure = np.flatnonzero(LAYOUT.pad_kind == PadKind.PRESSURE)
+    resting, tapped, pressed = pressure[:3], pressure[3], pressure[4:]
+    for seed in range(40):
+        raw = noisy(np.random.default_rng(seed), sweeps=100, sd=0.5)
+        raw[:60, pressed] -= 10.0
+        raw[:5, tapped] -= 12.0
+        found = calibrated(raw)
+        assert (found.verdict[pressed] == Verdict.TOUCHED).all()
+        assert not (found.verdict[resting] == Verdict.TOUCHED).any()
+
+
 @pytest.mark.parametrize("sd", [0.4, 1.2, 3.0])
 def test_what_drifts_less_than_a_touch_while_it_is_calibrated_is_no_touch(sd):
     for seed in range(5):
