@@ -17,7 +17,6 @@ from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TRIANGLES, StatusError
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.calibration import Calibration
-from skin_host.processing.drift import SETTLE_S
 from skin_host.processing.frame import PressureFrame
 from skin_host.processing.glimpses import Glimpses
 from skin_host.processing.intake import Intake, below_zero
@@ -27,9 +26,7 @@ from skin_host.processing.pipeline import Pipeline
 from skin_host.processing.pressed_zero import PressedZero
 from skin_host.processing.returned_chips import ReturnedChips
 from skin_host.processing.rezero import (
-    BELOW_SWEEPS,
     END,
-    JUMPS_NS,
     STEADY_UNITS,
     Rezero,
     highest_rest,
@@ -37,12 +34,7 @@ from skin_host.processing.rezero import (
     repeats_of,
 )
 from skin_host.processing.silent_zero import STILL_SHARE, SilentZero
-
-#: One reading inside the scale counts as so many at its end: a pad whose noise reaches inside in a
-#: tenth of its readings rests within 1.3 standard deviations of the end.
-INSIDE_WEIGHT = 9
-#: The byte at the end of the scale, to be found among those of a sweep.
-END_BYTE = bytes((END,))
+from skin_host.processing.wrong_zeros import WrongZeros
 
 
 class BoardZeros:
@@ -94,14 +86,7 @@ class BoardZeros:
         #: Triangles bool[16] of a board whose chips did not answer when they were last received,
         #: and whether any of these was missing from its last sweep.
         self._unanswered: dict[int, tuple[Mask, bool]] = {}
-        #: In how many sweeps in a row that came pads int64[16, 12] of a board have read far below
-        #: zero, where any do.
-        self._below: dict[int, NDArray[np.int64]] = {}
-        #: Of how many sweeps more pads int64[16, 12] of a board have sent the end of the scale than
-        #: readings inside, these by `INSIDE_WEIGHT`, where any have.
-        self._at_end: dict[int, NDArray[np.int64]] = {}
-        #: When a board's pad last came back from far below zero by itself.
-        self._jumped_ns: dict[int, int] = {}
+        self._wrong = WrongZeros()
         self._touched = np.zeros(layout.n_taxels, np.bool_)
         #: Whether each taxel was touched when it was last valid. A board that restarts in a touch
         #: is silent before it is zeroed: its touches have ended as lost, and may still be there.
@@ -126,8 +111,7 @@ class BoardZeros:
         self._awaited = before._awaited
         self._glimpses = before._glimpses
         self._unanswered = before._unanswered
-        self._below, self._at_end = before._below, before._at_end
-        self._jumped_ns = before._jumped_ns
+        self._wrong.go_on(before._wrong)
         self._touched = before._touched
         self._last_touched = before._last_touched
         self._touched_before, self._pressed = before._touched_before, before._pressed
@@ -144,7 +128,7 @@ class BoardZeros:
             self._silent_zeros.pop(board, None)
             self._returned.forget(board)
             self._glimpses.forget(board)
-            self._at_end.pop(board, None)
+            self._wrong.forget(board)
             self._forget_pressed(board)
         self.release(boards)
         zeroed = self._layout.taxels_of(boards)
@@ -173,9 +157,9 @@ class BoardZeros:
         if row in ledger.twice:
             self._note_twice(sweep, row)
             return
-        if ledger.flagged[row] or self._below:
+        if ledger.flagged[row] or self._wrong.below:
             self._note_below_zero(sweep, row)
-        if END_BYTE in sweep.raw.tobytes() or sweep.board in self._at_end:
+        if self._wrong.may_be_at_end(sweep):
             self._note_at_end(sweep, row)
         if self._pressed:
             pressed_zero = self._pressed.get(sweep.board)
@@ -296,7 +280,7 @@ class BoardZeros:
         if self._calibration is None:
             return 0
         self._glimpses.forget(board)
-        self._at_end.pop(board, None)
+        self._wrong.forget(board)
         if before is not None:
             touched |= before.unknown.reshape(TRIANGLES, PADS)
         own = self._layout.boards[board].settings
@@ -377,8 +361,8 @@ class BoardZeros:
         found = np.zeros((TRIANGLES, PADS), np.bool_)
         if board in self.rezeros:
             found |= self.rezeros[board].unknown.reshape(TRIANGLES, PADS)
-        if board in self._below:
-            found |= self._below[board] > 0
+        if board in self._wrong.below:
+            found |= self._wrong.below[board] > 0
         return found
 
     def unclear(self, board: int) -> Mask | None:
@@ -416,7 +400,7 @@ class BoardZeros:
         """Return how many taxels of each board that was zeroed have an unknown zero, by index."""
         return {
             board: int(np.count_nonzero(self.in_doubt(board)))
-            for board in sorted(self.rezeros.keys() | self._below.keys())
+            for board in sorted(self.rezeros.keys() | self._wrong.below.keys())
         }
 
     def _of(self, board: int) -> NDArray[np.int32]:
@@ -684,58 +668,32 @@ class BoardZeros:
         return pressed.reshape(TRIANGLES, PADS)
 
     def _note_below_zero(self, sweep: Sweep, row: int) -> None:
-        """Detect pads whose zero was taken while something pressed that has lifted now."""
-        answered = self._ledger.answered(row)
-        below = below_zero(sweep.raw, self._ledger.far[row] & answered[:, None])
-        before = self._below.pop(sweep.board, None)
-        rezero = self.rezeros.get(sweep.board)
-        if rezero is not None and not rezero.begun:
-            # What another zero brings back did not jump.
-            before = None
-        no_load = float(self._layout.boards[sweep.board].settings.no_load)
-        if before is not None:
-            back = (before > 0) & (before < BELOW_SWEEPS) & answered[:, None]
-            if rezero is not None:
-                # What is known to have been pressed comes back when it is pressed again.
-                back &= ~rezero.unknown.reshape(TRIANGLES, PADS)
-            if any_of(back & (sweep.raw < (no_load + 255) / 2)):
-                # What was pressed and lifts stays below zero; what a bad wire brings does not.
-                self._jumped_ns[sweep.board] = sweep.t_ns
-        jumps = 0 <= sweep.t_ns - self._jumped_ns.get(sweep.board, -JUMPS_NS) < JUMPS_NS
-        if self._calibration is None or jumps:
-            return
-        lasted = below.astype(np.int64)
-        if before is not None:
-            lasted += before * (below | ~self._ledger.present[row][:, None])
-        if not any_of(lasted > 0):
-            return
-        self._below[sweep.board] = lasted
-        self._doubt_pads(sweep, lasted >= BELOW_SWEEPS)
-
-    def _note_at_end(self, sweep: Sweep, row: int) -> None:
-        """Detect pads that rest at the end of the scale, or beyond it.
-
-        Their zero was taken under a press that has lifted, but not by so much that their board
-        marks them as far out of range, or has drifted that far. Nobody knows where they rest, so
-        that a press is felt late and measured too low. Beside a touch skin bulges, and may read so
-        for as long as the touch lasts.
-        """
+        """Doubt pads whose zero was taken while something pressed that has lifted now."""
         if self._calibration is None:
             return
-        far = self._ledger.far[row]
-        here = self._ledger.answered(row) & ~self._intake.reads_another(row, sweep.raw)
+        ledger, rezero = self._ledger, self.rezeros.get(sweep.board)
+        answered = ledger.answered(row)
+        below = below_zero(sweep.raw, ledger.far[row] & answered[:, None])
+        pressed, is_new = np.zeros_like(below), False
+        if rezero is not None:
+            pressed = rezero.unknown.reshape(TRIANGLES, PADS)
+            is_new = not rezero.begun
+        no_load = float(self._layout.boards[sweep.board].settings.no_load)
+        received = answered, ledger.present[row]
+        wrong = self._wrong.note_below(sweep, below, received, pressed, no_load, is_new=is_new)
+        self._doubt_pads(sweep, wrong)
+
+    def _note_at_end(self, sweep: Sweep, row: int) -> None:
+        """Doubt pads that rest at the end of the scale, or beyond it."""
+        if self._calibration is None:
+            return
         taxels = self._of(sweep.board)
-        pads = here[:, None] & ~far & (taxels >= 0) & self._calibration.usable[taxels]
-        at_end = pads & (sweep.raw == END)
-        lasted = self._at_end.pop(sweep.board, np.zeros(at_end.shape, np.int64))
-        if row not in self._intake.touched:
-            lasted += at_end
-        lasted -= INSIDE_WEIGHT * (pads & ~at_end)
-        np.maximum(lasted, 0, out=lasted)
-        if lasted.any():
-            self._at_end[sweep.board] = lasted
-            period_s = self._layout.boards[sweep.board].settings.period_ms * 1e-3
-            self._doubt_pads(sweep, lasted * period_s >= SETTLE_S)
+        here = self._ledger.answered(row) & ~self._intake.reads_another(row, sweep.raw)
+        pads = here[:, None] & ~self._ledger.far[row]
+        pads &= (taxels >= 0) & self._calibration.usable[taxels]
+        period_s = self._layout.boards[sweep.board].settings.period_ms * 1e-3
+        touching = row in self._intake.touched
+        self._doubt_pads(sweep, self._wrong.note_at_end(sweep, pads, period_s, touching=touching))
 
     def _doubt_pads(self, sweep: Sweep, pads: Mask) -> None:
         """The zero of some pads, bool[16, 12], of the board of a sweep is not known."""
