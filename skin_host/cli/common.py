@@ -134,15 +134,21 @@ def add_log_level(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--verbose", "-v", action="store_true", help="log more")
 
 
-def set_up_logging(verbose: bool) -> None:
-    """Log to stderr, for people or for systemd's journal, and never wait until they read it."""
+def set_up_logging(verbose: bool, name: str | None = None) -> None:
+    """Log to stderr, for people or for systemd's journal, and never wait until they read it.
+
+    Args:
+        verbose: log more.
+        name: of this process, before each line, where several log to one stderr.
+    """
     if (raw := stderr.current()) is not None:
         raw.write_in_thread()
     handler = logging.StreamHandler(sys.stderr)
+    line = "%(message)s" if name is None else name.replace("%", "%%") + ": %(message)s"
     handler.setFormatter(
-        service.JournalFormatter("%(message)s")
+        service.JournalFormatter(line)
         if service.to_journal()
-        else service.LogFormatter("%(levelname)-7s %(message)s")
+        else service.LogFormatter(f"%(levelname)-7s {line}")
     )
     logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler])
     for noisy in ("mqtt", "asyncio"):

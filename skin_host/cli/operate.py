@@ -200,7 +200,7 @@ def reload_on_hangup(daemon: "Daemon") -> None:
     reloading: set[asyncio.Task[None]] = set()
 
     async def reload() -> None:
-        service.notify_reloading(daemon.clock)
+        service.notify(service.reloading(daemon.clock))
         try:
             await daemon.reload()
         except SkinError as error:
@@ -235,22 +235,24 @@ def _run_node(arguments: argparse.Namespace) -> int:
     from skin_host.layout import build_layout, parts_of
     from skin_host.processes import end_with_parent
 
-    set_up_logging(arguments.verbose)
+    node, is_share = arguments.node, arguments.share is not None
+    if is_share:
+        node = share_name(node, arguments.share[0])
+    # The lines of all shares come to one log.
+    set_up_logging(arguments.verbose, node if is_share else None)
     settings, layout = load_skin(arguments.config)
     refuse_left_behind(settings, arguments.config.parent)
     if arguments.workers is not None:
         return _run_workers(arguments, settings, layout)
-    node = arguments.node
 
     def ours(settings: Settings) -> Settings:
         """A configuration as this process has it: of one share, or as it is."""
-        if arguments.share is None:
+        if not is_share:
             return settings
         return share_of(settings, arguments.node, *arguments.share)
 
-    if arguments.share is not None:
+    if is_share:
         end_with_parent(arguments.parent)
-        node = share_name(arguments.node, arguments.share[0])
         settings = ours(settings)
         layout = build_layout(settings, arguments.config.parent)
     parts_of(layout, node)
@@ -267,7 +269,7 @@ def _run_node(arguments: argparse.Namespace) -> int:
             memory=memory,
         )
         reload_on_hangup(daemon)
-        if arguments.share is None:
+        if not is_share:
             _show_running(settings)
         # The collector would look through all that is loaded by now for 30 ms, again and again.
         gc.freeze()
@@ -278,7 +280,6 @@ def _run_node(arguments: argparse.Namespace) -> int:
         memory = remembered(settings, layout, node, arguments.node, take_new=arguments.calibrate)
         warn_of_virtual(settings)
         # SIGHUP reloads. A service sends a request to end to each share, and their parent, too.
-        is_share = arguments.share is not None
         run(work, arguments.duration, service.ENDING, patient=is_share)
     return 0
 

@@ -83,9 +83,9 @@ def ended_at_once() -> Iterator[None]:
                 signal.signal(number, handler)
 
 
-def notify_reloading(clock: "Clock") -> None:
-    """Report to systemd that a reload has begun; READY=1 ends it."""
-    notify(f"RELOADING=1\nMONOTONIC_USEC={clock.monotonic_ns() // 1000}")
+def reloading(clock: "Clock") -> str:
+    """Return the message to systemd that a reload has begun; READY=1 ends it."""
+    return f"RELOADING=1\nMONOTONIC_USEC={clock.monotonic_ns() // 1000}"
 
 
 def to_journal() -> bool:

@@ -19,6 +19,7 @@ import socket
 import sys
 from collections.abc import Sequence
 
+from skin_host.clock import SYSTEM
 from skin_host.config.settings import LAST_PORT, Settings, changed, parse_triangles
 from skin_host.daemon import service
 from skin_host.errors import RequestError
@@ -48,14 +49,20 @@ class Merged:
         self._status = dict.fromkeys(names, "starting")
         self._is_stopping = False
 
+    def reload(self, message: str, names: Sequence[str]) -> list[str]:
+        """Some daemons reload, or are asked to: wait for all of them, although one may be ready
+        before another has begun. Return the messages to systemd: this one, unless it waits already.
+        """
+        messages = [] if self._unready else [message]
+        self._unready.update(names)
+        return messages
+
     def take(self, name: str, message: str) -> list[str]:
         """Take a message of a daemon; return the messages to systemd."""
         said = dict(line.partition("=")[::2] for line in message.splitlines())
         told = []
         if "RELOADING" in said:
-            if not self._unready:
-                told.append(message)
-            self._unready.add(name)
+            told += self.reload(message, [name])
         if said.get("READY") == "1" and name in self._unready:
             self._unready.discard(name)
             if not self._unready:
@@ -91,6 +98,11 @@ async def run(commands: dict[str, list[str]]) -> int:
             with contextlib.suppress(ProcessLookupError):
                 process.send_signal(number)
 
+    def reload() -> None:
+        for message in merged.reload(service.reloading(SYSTEM), list(processes)):
+            service.notify(message)
+        forward(signal.SIGHUP)
+
     def abort() -> None:
         """systemd's watchdog was not notified: the log shows where the daemon hangs that is why."""
         for name in merged.unfed & processes.keys():
@@ -104,7 +116,7 @@ async def run(commands: dict[str, list[str]]) -> int:
 
     for caught in service.ENDING:
         loop.add_signal_handler(caught, end, caught)
-    loop.add_signal_handler(signal.SIGHUP, forward, signal.SIGHUP)
+    loop.add_signal_handler(signal.SIGHUP, reload)
     loop.add_signal_handler(signal.SIGABRT, abort)
     with contextlib.ExitStack() as stack:
         for name, arguments in commands.items():

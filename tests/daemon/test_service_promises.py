@@ -183,7 +183,7 @@ def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         monkeypatch.setenv("NOTIFY_SOCKET", str(path))
         service.notify("READY=1")
         assert systemd.recv(100) == b"READY=1"
-        service.notify_reloading(SYSTEM)
+        service.notify(service.reloading(SYSTEM))
         assert systemd.recv(100).startswith(b"RELOADING=1\nMONOTONIC_USEC=")
 
 

@@ -151,6 +151,18 @@ def test_the_service_is_ready_with_the_last_and_fed_by_all() -> None:
     assert merged.take("main-1", "STOPPING=1") == []
 
 
+def test_a_reload_ends_with_the_last_also_where_one_is_done_before_another_has_begun() -> None:
+    names = ["main-1", "main-2"]
+    merged = Merged(names)
+    assert [merged.take(name, "READY=1") for name in names] == [[], ["READY=1"]]
+    reloading = "RELOADING=1\nMONOTONIC_USEC=5"
+    assert merged.reload(reloading, names) == [reloading]
+    assert merged.take("main-1", reloading) == []
+    assert merged.take("main-1", "READY=1") == []
+    assert merged.take("main-2", reloading) == []
+    assert merged.take("main-2", "READY=1") == ["READY=1"]
+
+
 class Ends:
     """A daemon that ends in good order when it is asked to, and otherwise only when killed."""
 
@@ -363,7 +375,7 @@ async def test_a_service_of_two_workers_is_one_robot(mosquitto: Mosquitto, tmp_p
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "skin_host", "run", config, "--workers", "2"),
             env=os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify"), "TMPDIR": str(temporary)},
-            stderr=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
         )
         try:
             found = await states(mosquitto)
@@ -372,7 +384,10 @@ async def test_a_service_of_two_workers_is_one_robot(mosquitto: Mosquitto, tmp_p
             while (await asyncio.to_thread(systemd.recv, 4096)) != b"READY=1":
                 pass
             process.send_signal(signal.SIGTERM)
-            assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
+            _, log = await asyncio.wait_for(process.communicate(), PATIENCE_S)
+            assert process.returncode == 0
+            named = [line.split()[1] for line in log.decode().splitlines() if line.split()[1:]]
+            assert {"main-1:", "main-2:"} <= set(named)
         finally:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
