@@ -1,4 +1,4 @@
-"""The client for programs without asyncio: a separate thread receives and calls back."""
+"""The client for programs without asyncio: one thread receives, another one calls back."""
 
 import asyncio
 import logging
@@ -11,13 +11,15 @@ from typing import Any, Literal, Self, TypeVar
 from skin_host.client.heard import Described, Health
 from skin_host.client.presence import STALE_S, Contact
 from skin_host.client.session import SkinClient
-from skin_host.client.streams import Stream
+from skin_host.client.streams import ENDED, Stream
+from skin_host.clock import SYSTEM
 from skin_host.errors import RequestError, SkinError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.info import NodeInfo
 from skin_host.mqtt.messages import Frame
 from skin_host.processing.events import Touch
+from skin_host.tasks import cancel
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -31,9 +33,11 @@ class SkinCallbacks:
             input("Enter ends it")
 
     The functions run one after the other in one thread, which is not the caller's: data that they
-    share with it needs a lock, and while one of them runs nothing else is received. An exception in
-    one of them is logged, and the next ones are called. In them `present` and `parts` can be asked,
-    and nothing that waits: `ready`, `info`, `command` and `on_...` raise a RequestError there.
+    share with it needs a lock. While one of them runs the others wait, and messages are received:
+    then each function gets its next one in turn, so that a slow one holds another up only once. An
+    exception in one of them is logged, and the next ones are called. In them `present` and `parts`
+    can be asked, and nothing that waits: `ready`, `info`, `command` and `on_...` raise a
+    RequestError there. Leaving the block waits for the function that runs.
 
     Raises (on entering): see `SkinClient`.
     Raises (in use):
@@ -73,8 +77,10 @@ class SkinCallbacks:
         #: By stream: that the robot has no part of its name, or the broker refuses its topic.
         self._failures: dict[Stream[Any], SkinError] = {}
         self._thread = threading.Thread(
-            target=lambda: asyncio.run(self._serve()), name="skin callbacks", daemon=True
+            target=lambda: asyncio.run(self._serve()), name="skin client", daemon=True
         )
+        #: In which the functions are called, since the first call.
+        self._calling: threading.Thread | None = None
 
     def on_touch(self, call: Callable[[Touch], object], part: str | None = None) -> None:
         """Call with each touch event of a part, or of all."""
@@ -149,6 +155,7 @@ class SkinCallbacks:
         return self
 
     def __exit__(self, kind: type[BaseException] | None = None, *_: object) -> None:
+        self._refuse_callback()
         self._loop.call_soon_threadsafe(self._end.set)
         self._thread.join()
         if kind is None and self._failures:
@@ -157,8 +164,12 @@ class SkinCallbacks:
     async def _serve(self) -> None:
         try:
             async with self._make() as skin:
+                self._caller = SYSTEM.executor("skin callbacks")
                 self._ready.set_result((skin, asyncio.get_running_loop()))
                 await self._end.wait()
+                await cancel(*self._calls)
+                # The function that runs, and may ask, is the last.
+                await asyncio.wrap_future(self._caller.submit(self._caller.close))
         except BaseException as error:
             if self._ready.done():
                 raise
@@ -190,27 +201,35 @@ class SkinCallbacks:
                 continue
             if isinstance(self._failures.get(stream), RequestError):
                 del self._failures[stream]
-            try:
-                call(item)
-            except BaseException:  # SystemExit would end the thread, and what the others receive
-                _log.exception("a callback failed")
+            await asyncio.wrap_future(self._caller.submit(self._call, call, item))
+
+    def _call(self, call: Callable[[T], object], item: T) -> None:
+        self._calling = threading.current_thread()
+        try:
+            call(item)
+        except BaseException:  # SystemExit would end the thread, and what the others receive
+            _log.exception("a callback failed")
 
     def _ask(self, question: Callable[[SkinClient], T]) -> T:
         """Ask for what the client knows; that can be asked in a callback, too."""
-        if threading.current_thread() is self._thread:
-            return question(self._skin)
 
         async def found(skin: SkinClient) -> T:
             return question(skin)
 
-        return self._wait_for(found)
+        return self._result_of(found)
 
     def _wait_for(self, work: Callable[[SkinClient], Coroutine[Any, Any, T]]) -> T:
-        if threading.current_thread() is self._thread:
+        self._refuse_callback()
+        return self._result_of(work)
+
+    def _refuse_callback(self) -> None:
+        if threading.current_thread() is self._calling:
             raise RequestError("a callback cannot wait for messages; ask in another thread")
+
+    def _result_of(self, work: Callable[[SkinClient], Coroutine[Any, Any, T]]) -> T:
         if self._thread.ident is None:
             raise RequestError("these callbacks were not entered: use them in their `with` block")
-        ended = RequestError("these callbacks have ended: nothing is received any more")
+        ended = RequestError(ENDED)
         with self._giving:
             if self._is_over:
                 raise ended

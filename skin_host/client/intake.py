@@ -44,6 +44,7 @@ class Intake:
         nodes: the robot's daemons.
         parts: names of parts that were received.
         unreadable: messages that could not be read.
+        info_error: why the last info could not be read.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Intake:
         self.nodes = Nodes(self.presence)
         self.parts: set[str] = set()
         self.unreadable = 0
+        self.info_error = ""
         self._streams = streams
         self._requests = requests
         self._brokers = brokers
@@ -100,6 +102,8 @@ class Intake:
                 self._take_part(kind, name, payload, link, message)
         except SkinError as error:
             self._note_unreadable(message.topic.value, error)
+            if kind == "info":
+                self.info_error = visible(f"{message.topic.value}: {error}")
             if not isinstance(error, MessageError):  # it is we who cannot read it
                 for stream in self._streams:
                     if stream.takes(kind, name):

@@ -149,6 +149,8 @@ class BrokerLink:
             group.create_task(self._keep_subscribed(connection))
             async for message in connection.messages:
                 self._hearer.take(self, message)
+                for other in connection.waiting():
+                    self._hearer.take(self, other)
 
     async def _keep_subscribed(self, connection: Connection) -> None:
         while True:
@@ -194,20 +196,8 @@ async def only_robot(connection: Connection, broker: Broker, base: str) -> str:
         BrokerError: there is none, or it does not let us know which there are.
         RequestError: there is more than one.
     """
-    prefix = f"{base}/"
-    # By topic: of two statuses of a node the later one is true.
-    statuses: dict[str, object] = {}
-    everybody = f"{prefix}+/nodes/+/status"
-    if not await connection.listen_to(everybody, as_published=False):
-        raise refusal(broker, everybody)
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(FIRST_RETAINED_S) as waiting:
-            async for message in connection.messages:
-                if not statuses:
-                    waiting.reschedule(asyncio.get_running_loop().time() + RETAINED_S)
-                statuses[message.topic.value] = message.payload
-    await connection.unsubscribe(everybody)
-    robots = {topic: topic.removeprefix(prefix).partition("/")[0] for topic in statuses}
+    statuses = await _statuses(connection, broker, base, FIRST_RETAINED_S)
+    robots = {topic: topic.removeprefix(f"{base}/").partition("/")[0] for topic in statuses}
     known = set(robots.values())
     meant = {robots[topic] for topic, status in statuses.items() if status == ONLINE} or known
     if not meant:
@@ -220,3 +210,43 @@ async def only_robot(connection: Connection, broker: Broker, base: str) -> str:
             f'broker {broker}: wanted one robot below "{base}", there are: {names}; name the robot'
         )
     return meant.pop()
+
+
+async def robots_at(broker: Broker, base: str, identifier: str) -> list[str]:
+    """Return the names of the robots that a broker knows, as far as it answers at once."""
+    try:
+        async with connect(
+            broker, identifier=identifier, max_incoming=MAX_INCOMING, max_packet=MAX_PACKET_BYTES
+        ) as connection:
+            topics = await _statuses(connection, broker, base, RETAINED_S)
+    except (MqttError, SkinError):
+        return []
+    return sorted({topic.removeprefix(f"{base}/").partition("/")[0] for topic in topics})
+
+
+async def _statuses(
+    connection: Connection, broker: Broker, base: str, first_s: float
+) -> dict[str, object]:
+    """Return the statuses of all nodes below the base by topic: of two of a node the later one.
+
+    Args:
+        connection: to the broker.
+        broker: which one.
+        base: of the topics.
+        first_s: how long to wait for the first one.
+
+    Raises:
+        BrokerError: the broker does not let us know them.
+    """
+    statuses: dict[str, object] = {}
+    everybody = f"{base}/+/nodes/+/status"
+    if not await connection.listen_to(everybody, as_published=False):
+        raise refusal(broker, everybody)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(first_s) as waiting:
+            async for message in connection.messages:
+                if not statuses:
+                    waiting.reschedule(asyncio.get_running_loop().time() + RETAINED_S)
+                statuses[message.topic.value] = message.payload
+    await connection.unsubscribe(everybody)
+    return statuses

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import Literal, NamedTuple
 
-from skin_host.mqtt.messages import ContactState
+from skin_host.mqtt.messages import ContactState, Frame
 from skin_host.mqtt.order import Stamp
 from skin_host.processing.events import Touch
 
@@ -54,7 +54,9 @@ DISTANCE_S = 120.0
 
 
 def taxels_of(item: object) -> int:
-    """Return how many taxels an item names: a touch may name very many, others none."""
+    """Return how many taxels an item names: touches and frames may name very many, others none."""
+    if isinstance(item, Frame):
+        return len(item.valid)
     return len(item.taxels) if isinstance(item, Touch) else 0
 
 

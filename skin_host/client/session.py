@@ -12,7 +12,14 @@ from weakref import WeakSet
 from skin_host.client.absent import no_such_part, unpublished
 from skin_host.client.heard import Described, Health
 from skin_host.client.intake import Intake
-from skin_host.client.links import RETAINED_S, ROBOT_S, BrokerLink, only_robot, refusal
+from skin_host.client.links import (
+    RETAINED_S,
+    ROBOT_S,
+    BrokerLink,
+    only_robot,
+    refusal,
+    robots_at,
+)
 from skin_host.client.nodes import Node
 from skin_host.client.presence import STALE_S, Contact
 from skin_host.client.requests import (
@@ -22,9 +29,9 @@ from skin_host.client.requests import (
     answer_within_s,
     refuse_wrong_name,
 )
-from skin_host.client.streams import Kind, Stream, refuse_other_loop
+from skin_host.client.streams import ENDED, UNENTERED, Kind, Stream, refuse_other_loop
 from skin_host.client.subscriptions import Subscriptions
-from skin_host.errors import BrokerError, RequestError, SkinError
+from skin_host.errors import BrokerError, RequestError, SkinError, some_of, visible
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import (
@@ -83,8 +90,9 @@ class SkinClient:
         RequestError: it is not clear which robot is meant, or the client was entered before.
 
     Raises (in use):
-        RequestError: no part can have such a name, or the event loop is not the one in which the
-            client was entered.
+        RequestError: no part can have such a name, the event loop is not the one in which the
+            client was entered, or it was not entered, or has ended. Streams may be opened before it
+            is entered.
 
     Raises (on reading a stream, once):
         RequestError: the robot has no part of this name, and had none since the stream was opened.
@@ -175,6 +183,12 @@ class SkinClient:
         """How many messages could not be read."""
         return self._intake.unreadable
 
+    @property
+    def info_error(self) -> str:
+        """Why no node of the robot is described, if what one published could not be read."""
+        is_described = any(node.info for node in self.nodes.values())
+        return "" if is_described else self._intake.info_error
+
     def touches(self, part: str | None = None) -> Stream[Touch]:
         """Touch events of a part, or of all."""
         return self._stream(part, "touch")
@@ -192,7 +206,11 @@ class SkinClient:
         return self._stream(part, "touch", "slip", "over")
 
     def frames(self, part: str | None = None) -> Stream[Frame]:
-        """Frames of a part, or of all: pressure in kPa as numpy arrays."""
+        """Frames of a part, or of all: pressure in kPa as numpy arrays.
+
+        A reader that is more than `LATE_S` late continues with the newest frame of each part; the
+        others are counted by its `missed`.
+        """
         return self._stream(part, "frame")
 
     def contacts(self, part: str | None = None) -> Stream[Contact]:
@@ -200,6 +218,8 @@ class SkinClient:
 
         The present one comes as soon as anything of the part does that the broker had not stored,
         which takes up to a second, or as UNKNOWN after `stale_s`.
+
+        A slow reader gets no OFF that is not true any more.
 
         UNKNOWN is an item of its own: when the node cannot feel all of the part, when the part was
         not received for `stale_s` or its state was deleted, when its node stops or the broker is
@@ -217,6 +237,7 @@ class SkinClient:
             RequestError: the robot has no such part.
             BrokerError: a broker does not let us subscribe to its touches.
         """
+        self._check_entered()
         self._check_use(part)
         missing = self._missing(part, _now_s())
         if missing is not None:
@@ -274,10 +295,8 @@ class SkinClient:
         known = {name: node.info for name, node in self.nodes.items() if node.info is not None}
         if not known:
             self._refuse_unread(lambda subscriptions: set(subscriptions.nodes))
-            raise BrokerError(
-                f'broker {self.where}: no node of robot "{self.robot}" published its info; '
-                "is `skin run` running?"
-            )
+            why = self.info_error or await self._nobody("published its info")
+            raise BrokerError(f"broker {self.where}: {why}")
         return known
 
     async def command(
@@ -314,7 +333,7 @@ class SkinClient:
             try:
                 async with asyncio.timeout(timeout_s):
                     known = await self._nodes_of_command(node)
-                    node = node or self._only(known)
+                    node = node or await self._only(known)
                     self._refuse_deaf(node)
                     self._refuse_unread(lambda subscriptions: {subscriptions.replies})
                     await self._ask(node, name, request.payload)
@@ -352,7 +371,7 @@ class SkinClient:
             raise RequestError("this client was entered before: make another one")
         self._loop = asyncio.get_running_loop()
         for stream in self._streams:
-            stream.loop = self._loop
+            stream.loop, stream.is_early = self._loop, False
         self._tasks = [
             asyncio.create_task(link.run(), name=f"skin client {link.broker}")
             for link in self._links
@@ -413,6 +432,7 @@ class SkinClient:
     async def _stop(self) -> None:
         self._stopping = True
         await cancel(*self._tasks)
+        self._nodes.watch(_now_s())
         self._news.set()
         for stream in list(self._streams):
             stream.close()
@@ -421,18 +441,27 @@ class SkinClient:
         """Wait until `condition` holds, and return its result.
 
         Raises:
-            RequestError: the client has ended, or was entered in another event loop.
+            RequestError: the client was not entered, or in another event loop, or has ended.
         """
-        refuse_other_loop(self._loop)
+        self._check_entered()
         while not (found := condition()):
-            if self._stopping:
-                raise RequestError("the client has ended: what it is asked for cannot come")
+            self._check_running()
             self._news.clear()
             await self._news.wait()
         return found
 
-    def _check_use(self, part: str | None) -> None:
+    def _check_entered(self) -> None:
+        if self._loop is None:
+            raise RequestError(UNENTERED)
+        self._check_running()
+
+    def _check_running(self) -> None:
         refuse_other_loop(self._loop)
+        if self._stopping:
+            raise RequestError(ENDED)
+
+    def _check_use(self, part: str | None) -> None:
+        self._check_running()
         # A subscription that cannot be made would end the connection, again and again.
         wrong = None if part is None else wrong_part(part)
         if wrong is not None:
@@ -441,7 +470,7 @@ class SkinClient:
     def _stream(self, part: str | None, *kinds: Kind) -> Stream[Any]:
         self._check_use(part)
         stream: Stream[Any] = Stream(part, *kinds)
-        stream.loop = self._loop
+        stream.loop, stream.is_early = self._loop, self._loop is None
         self._streams.add(stream)
         self._intake.begin(stream)
         self._ask_again()
@@ -498,7 +527,17 @@ class SkinClient:
             )
         return known
 
-    def _only(self, known: list[str]) -> str:
+    async def _nobody(self, what: str) -> str:
+        """Return that no node of the robot did something, and which other robots there are."""
+        start = f'no node of robot "{self.robot}" {what}; '
+        link = self._links[0]
+        others: list[str] = []
+        if link.connection and not self.nodes:
+            others = await robots_at(link.broker, self._base, f"{self._identifier}-robots")
+        names = some_of([visible(name, 64) for name in others])
+        return start + (f"there are the robots: {names}" if names else "is `skin run` running?")
+
+    async def _only(self, known: list[str]) -> str:
         """Return the node of these that is online.
 
         Raises:
@@ -510,10 +549,7 @@ class SkinClient:
         if len(online) == 1:
             return online[0]
         if not online:
-            raise BrokerError(
-                f'broker {self.where}: no node of robot "{self.robot}" is online; '
-                "is `skin run` running?"
-            )
+            raise BrokerError(f"broker {self.where}: {await self._nobody('is online')}")
         raise RequestError(
             f'robot "{self.robot}": wanted one node that is online, there are: '
             f"{', '.join(online)}; name the node"

@@ -7,7 +7,7 @@ from typing import Any, Generic, Literal, NamedTuple, TypeVar, cast
 
 from msgspec.structs import replace
 
-from skin_host.client.presence import taxels_of
+from skin_host.client.presence import Contact, taxels_of
 from skin_host.errors import RequestError, SkinError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.messages import Frame
@@ -29,9 +29,16 @@ HELD: dict[Kind, int] = {
 }
 #: A state is true until the next one of its part. There are fewer parts than items held.
 STATES = {"contact", "health", "info"}
-#: Of touches no more than have this many taxels together: whoever may publish could send some of
-#: a hundred thousand each.
+#: Of touches and frames no more than have this many taxels together: whoever may publish could send
+#: some of a hundred thousand each.
 HELD_TAXELS = 5_000_000
+#: For a reader that is later than this, older frames and states are left out: they look like those
+#: of now. A broker keeps frames no longer either.
+LATE_S = 1.0
+#: Of these. Events are all read, and what is left out of contact states does not depend on time.
+AGING = {"frame", "health", "info"}
+UNENTERED = "this client was not entered: use it in its `async with` block"
+ENDED = "this client has ended: nothing is received any more; make another one"
 #: An event that the broker got twice comes again within this many events.
 DUPLICATE_SPAN = 64
 
@@ -110,7 +117,7 @@ class Stream(AsyncIterator[T], Generic[T]):
         BrokerError: a broker does not let us subscribe to a topic that is needed.
 
     Raises (on reading):
-        RequestError: this is not the event loop in which the client was entered.
+        RequestError: the client was not entered yet, or in another event loop.
     """
 
     def __init__(self, part: str | None, *kinds: Kind) -> None:
@@ -118,6 +125,8 @@ class Stream(AsyncIterator[T], Generic[T]):
         self.kinds = kinds
         #: In which the client was entered.
         self.loop: asyncio.AbstractEventLoop | None = None
+        #: Its client was not entered yet.
+        self.is_early = False
         #: Whether it is known that there is such a part, or was reported that there is none.
         self.is_judged = part is None
         self._failure: str | None = None
@@ -126,6 +135,9 @@ class Stream(AsyncIterator[T], Generic[T]):
         self._refused: set[str] = set()
         self._refusals: deque[SkinError] = deque()
         self._items: deque[T] = deque()
+        self._ages = not AGING.isdisjoint(kinds)
+        #: When they came, by the event loop's clock, if they age.
+        self._arrived_s: deque[float] = deque()
         self._most = max(HELD[kind] for kind in kinds)
         self._taxels = 0
         self._wake = asyncio.Event()
@@ -153,13 +165,27 @@ class Stream(AsyncIterator[T], Generic[T]):
             if self._repeats.has(item):
                 return
             item = cast(T, self._counted(item, run))
+        if isinstance(item, Contact) and self._is_unread(item):
+            return
         self._items.append(item)
+        if self._ages:
+            self._arrived_s.append(_now_s())
         self._taxels += taxels_of(item)
         if len(self._items) > self._most:
             self._make_room()
         while self._taxels > HELD_TAXELS and len(self._items) > 1:
             self._drop()
         self._wake.set()
+
+    def _is_unread(self, now: Contact) -> bool:
+        """Return whether a state is the last one of its part that was not read. An OFF before it,
+        which is not true any more, is left out: who is slow would take the part for untouched.
+        """
+        items = cast(deque[Contact], self._items)
+        mine = [at for at, item in enumerate(items) if item.part == now.part]
+        if mine and items[mine[-1]].state == "OFF":
+            del items[mine.pop()]
+        return bool(mine) and items[mine[-1]] == now
 
     def _make_room(self) -> None:
         """Drop the oldest item; of states the oldest that a newer one of its part follows: nothing
@@ -171,7 +197,10 @@ class Stream(AsyncIterator[T], Generic[T]):
         items: list[Any] = list(self._items)
         newest = {item.part: at for at, item in enumerate(items)}
         # Parts that anybody names, and names no longer, are more than those that there are.
-        del self._items[next((at for at, item in enumerate(items) if newest[item.part] > at), 0)]
+        oldest = next((at for at, item in enumerate(items) if newest[item.part] > at), 0)
+        del self._items[oldest]
+        if self._ages:
+            del self._arrived_s[oldest]
 
     def _drop(self) -> None:
         """Drop the oldest item; the next one of its part and kind counts it."""
@@ -180,8 +209,27 @@ class Stream(AsyncIterator[T], Generic[T]):
             kind = type(item), item.part
             self._lost[kind] = self._lost.get(kind, 0) + 1 + item.missed
 
+    def _catch_up(self) -> None:
+        """Let a reader that is late continue with the newest item of each part. A state is true
+        until the next one; of a frame nobody knows that.
+        """
+        oldest_s = _now_s() - LATE_S
+        if not self._arrived_s or self._arrived_s[0] >= oldest_s:
+            return
+        items = cast(deque[Any], self._items)
+        newest = {item.part: item for item in items}
+        for _ in range(len(items)):
+            is_now = self._arrived_s[0] >= oldest_s or not isinstance(items[0], Frame)
+            if is_now and items[0] is newest[items[0].part]:
+                items.rotate(-1)
+                self._arrived_s.rotate(-1)
+            else:
+                self._drop()
+
     def _pop(self) -> T:
         item = self._items.popleft()
+        if self._ages:
+            self._arrived_s.popleft()
         self._taxels -= taxels_of(item)
         return item
 
@@ -206,20 +254,23 @@ class Stream(AsyncIterator[T], Generic[T]):
             self._wake.set()
 
     async def __anext__(self) -> T:
+        if self.is_early:
+            raise RequestError(UNENTERED)
         if not self._closed:  # what is left may be read anywhere
             refuse_other_loop(self.loop)
         while True:
-            while self._refusals or not self._items:
-                if self._refusals:
-                    raise self._refusals.popleft()
-                if self._failure is not None:
-                    why, self._failure = self._failure, None
-                    raise RequestError(why)
-                if self._closed:
-                    raise StopAsyncIteration
-                self._wake.clear()
-                await self._wake.wait()
-            return self._take_out()
+            self._catch_up()
+            if self._refusals:
+                raise self._refusals.popleft()
+            if self._items:
+                return self._take_out()
+            if self._failure is not None:
+                why, self._failure = self._failure, None
+                raise RequestError(why)
+            if self._closed:
+                raise StopAsyncIteration
+            self._wake.clear()
+            await self._wake.wait()
 
     def _take_out(self) -> T:
         item: Any = self._pop()
@@ -258,3 +309,7 @@ class Stream(AsyncIterator[T], Generic[T]):
             missed = lost or number - before - 1
         self._last[kind] = _Last(run, number, item.t_ns)
         return max(0, missed)
+
+
+def _now_s() -> float:
+    return asyncio.get_running_loop().time()

@@ -27,7 +27,7 @@ import re
 import socket
 import ssl
 import struct
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from typing import Any, cast
 
@@ -67,6 +67,9 @@ _TAKEN_OVER = 0x8E
 _ENVELOPE_BYTES = 128
 #: What paho gives for a connection that was closed without a reason.
 _CLOSED = 0x80
+#: So many packets are read in one turn of the loop: the next turn comes late in a program that
+#: computes between the two.
+MOST_READ = 1000
 #: Usual acknowledgements, by their bytes after the number of the message: arrived, with and without
 #: a code, and arrived without anybody who listens. Decoding them costs paho as much as publishing.
 _USUAL_ACKS = {
@@ -387,6 +390,13 @@ class Connection(aiomqtt.Client):
         finally:
             del self._requests[sent.mid]
 
+    def waiting(self) -> Iterator[Message]:
+        """Yield the messages that have come and were not read: `messages` takes turns of the loop
+        for each.
+        """
+        while not self._queue.empty():
+            yield self._queue.get_nowait()
+
     async def lost(self) -> None:
         """Wait until the connection is lost.
 
@@ -542,11 +552,18 @@ class Connection(aiomqtt.Client):
         super()._on_disconnect(client, userdata, flags, reason_code, properties)
 
     def _bounded_read(self) -> MQTTErrorCode:
-        """Read as paho does, but keep only the checked part of a large packet."""
-        code: MQTTErrorCode = self._read_packet()
-        arriving = self._paho._in_packet
-        if arriving["remaining_length"] > max(self._max_packet, KEPT_BYTES):
-            del arriving["packet"][KEPT_BYTES:]
+        """Read as paho does, but all packets that have come and have room, and only the checked
+        part of a large one.
+        """
+        code: MQTTErrorCode = MQTT_ERR_SUCCESS
+        room = self._queue.maxsize - self._queue.qsize()
+        for _ in range(min(MOST_READ, max(1, room))):
+            code = self._read_packet()
+            arriving = self._paho._in_packet
+            if arriving["remaining_length"] > max(self._max_packet, KEPT_BYTES):
+                del arriving["packet"][KEPT_BYTES:]
+            if code != MQTT_ERR_SUCCESS or self._paho._sock is None:
+                break
         return code
 
     def _checked(self) -> MQTTErrorCode:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from skin_host.errors import SkinError
 from skin_host.mqtt.messages import SCALE_KPA, Frame
-from skin_host.mqtt.payload import MessageError, check_size, decode
+from skin_host.mqtt.payload import MessageError, check_size, decode, other_schema
 from skin_host.processing.events import MAX_TAXELS, Count, Nanoseconds
 from skin_host.processing.masks import Mask, any_of
 
@@ -210,7 +210,7 @@ def decode_frame(part: str, payload: bytes) -> Frame:
         fields = decode(_decoder, payload, "frame")
         values = np.array(fields.values, np.int32)
     if fields.schema != FRAME_SCHEMA:
-        raise MessageError(f'frame: schema "{fields.schema}"; this program reads {FRAME_SCHEMA}')
+        raise MessageError(other_schema("frame", fields.schema))
     n = len(values)
     beyond = decode_mask(fields.beyond_range, n) if fields.beyond_range else np.zeros(n, np.bool_)
     pressure_kpa = values.astype(np.float64) * fields.scale

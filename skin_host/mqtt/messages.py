@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Struct
 
 from skin_host.fingertip.events import FingertipEvent, Over, Slip
-from skin_host.mqtt.payload import MessageError, decode, decode_event
+from skin_host.mqtt.payload import MessageError, decode, decode_event, other_schema
 from skin_host.processing.events import Touch
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ def decode_health(payload: bytes) -> dict[str, Any]:
     """
     record = decode(_health_decoder, payload, "health")
     if record.get("schema") != HEALTH_SCHEMA:
-        raise MessageError(f"health: wanted the schema {HEALTH_SCHEMA}")
+        raise MessageError(other_schema("health", record.get("schema")))
     check_health(record)
     return record
 

@@ -10,8 +10,8 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skin_host.errors import SkinError
-from skin_host.untrusted import decoded
+from skin_host.errors import SkinError, visible
+from skin_host.untrusted import decoded, from_json
 
 #: No valid message is longer, with stated exceptions.
 MAX_BYTES = 4 * 1024 * 1024
@@ -27,6 +27,18 @@ S = TypeVar("S", bound=Struct)
 
 class MessageError(SkinError):
     """A payload does not fit its topic."""
+
+
+class _Schema(Struct):
+    schema: str = ""
+
+
+def other_schema(what: str, seen: object) -> str:
+    """Return that a payload of the topic `what` has a schema that is not ours."""
+    return (
+        f'{what}: schema "{visible(str(seen), 64)}"; this program reads skin.{what}/1: it needs '
+        "the version of skin-host that published it"
+    )
 
 
 def check_size(payload: bytes, what: str, max_bytes: int = MAX_BYTES) -> None:
@@ -51,7 +63,13 @@ def decode(
     try:
         return decoded(decoder, payload)
     except msgspec.DecodeError as error:
-        raise MessageError(f"{what}: {error}") from None
+        why = f"{what}: {error}"
+    try:
+        seen = from_json(payload, _Schema).schema
+    except msgspec.DecodeError:
+        raise MessageError(why) from None
+    is_ours = seen in ("", f"skin.{what}/1") or not seen.startswith(f"skin.{what}/")
+    raise MessageError(why if is_ours else other_schema(what, seen))
 
 
 def decode_event(decoder: "msgspec.json.Decoder[S]", payload: bytes, what: str) -> S:

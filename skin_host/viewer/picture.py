@@ -243,7 +243,10 @@ def _description(part: PartInfo, frame_hz: float) -> dict[str, Any]:
     """Describe a part for pages; its period is that of its frames, which may be thinned."""
     thinned_ms = 1000.0 / frame_hz if frame_hz > 0 else 0.0
     described: dict[str, Any] = msgspec.to_builtins(part)
-    return described | {"period_ms": max(part.period_ms, thinned_ms)}
+    return described | {
+        "period_ms": max(part.period_ms, thinned_ms),
+        "thinned": thinned_ms > part.period_ms,
+    }
 
 
 def _contacts_text(name: str, part: PartView, contact: Contact | None) -> str:

@@ -45,6 +45,8 @@ MAX_PAGES = 32
 #: A page that has not taken its new messages after this time is closed, and connects again when it
 #: can. A ping would not end it: it waits behind them.
 TAKEN_S = 60.0
+#: At the end a page has this long to answer that it is closed; one that sleeps does not.
+CLOSE_S = 0.5
 MAX_REQUEST_BYTES = 4096
 #: A page sends each request as one; pieces without bytes could go on for ever.
 MAX_PIECES = 16
@@ -173,7 +175,8 @@ class Viewer:
         )
 
         def visit() -> _Visit:
-            return _Visit(ServerProtocol(max_size=MAX_REQUEST_BYTES), server)
+            protocol = ServerProtocol(max_size=MAX_REQUEST_BYTES)
+            return _Visit(protocol, server, close_timeout=CLOSE_S)
 
         loop = asyncio.get_running_loop()
         with contextlib.ExitStack() as ports:
@@ -277,26 +280,28 @@ class Viewer:
             answer |= {"do": wish.do, "node": wish.node}
             if not self._commands:
                 raise RequestError("commands are switched off; start the page with them allowed")
-            if self._client is None:
-                raise BrokerError(self._why)
-            answer |= {"ok": True, "result": await self._carry_out(wish, self._client)}
+            answer |= {"ok": True, "result": await self._carry_out(wish)}
         except _REFUSED as error:
             answer |= {"ok": False, "error": str(error)}
         with contextlib.suppress(ConnectionClosed):
             await page.send(msgspec.json.encode(answer).decode())
 
-    async def _carry_out(self, wish: _Wish, client: SkinClient) -> Mapping[str, Any]:
+    async def _carry_out(self, wish: _Wish) -> Mapping[str, Any]:
         recording = self._recording
         match wish.do:
-            case "record":
-                broker, base = self._broker, None
-                if isinstance(broker, str):
-                    broker, base = Broker.from_url(broker)
-                return recording.start(broker, base or "skin", client.robot)
             case "mark":
                 return recording.mark(wish.text, wish.ago_s)
             case "stop":
                 return await recording.stop()
+        client = self._client
+        # A client would wait for the broker, and calibrate at a time that nobody expects.
+        if client is None or not client.connected:
+            raise BrokerError(self._why)
+        if wish.do == "record":
+            broker, base = self._broker, None
+            if isinstance(broker, str):
+                broker, base = Broker.from_url(broker)
+            return recording.start(broker, base or "skin", client.robot)
         arguments: dict[str, Any] = {"seconds": RAW_LEASE_S} if wish.do == "raw" else {}
         if wish.part is not None:
             arguments["part"] = wish.part
@@ -363,10 +368,11 @@ class Viewer:
             await asyncio.sleep(NODES_S)
 
     def _take_status(self, *, connected: bool) -> None:
+        client = self._client
         self._picture.take_status(
             {
                 "connected": connected,
-                "error": "" if connected else self._why,
+                "error": self._why if client is None or not connected else client.info_error,
                 "commands": self._commands,
                 "recording": self._recording.state,
             }

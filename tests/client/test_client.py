@@ -4,6 +4,7 @@ import asyncio
 import math
 import socket
 import threading
+import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
@@ -350,7 +351,7 @@ async def test_who_waits_for_a_client_that_ends_waits_no_longer(mosquitto: Mosqu
         await asyncio.sleep(0)
     async with asyncio.timeout(PATIENCE_S):
         for task in waiting:
-            with pytest.raises(RequestError, match="the client has ended"):
+            with pytest.raises(RequestError, match="this client has ended"):
                 await task
 
 
@@ -427,6 +428,31 @@ async def test_without_a_node_info_says_what_to_start(mosquitto: Mosquitto) -> N
             await skin.info(0.1)
 
 
+async def test_who_misspells_the_robot_reads_which_there_are(mosquitto: Mosquitto) -> None:
+    async with publishing(mosquitto), hearing(mosquitto, "robto") as skin:
+        for ask in (skin.info(1.0), skin.command("status", timeout_s=PATIENCE_S)):
+            with pytest.raises(BrokerError, match=r'no node of robot "robto".*robots: robot$'):
+                await ask
+
+
+async def test_a_node_whose_info_cannot_be_read_is_not_called_absent(mosquitto: Mosquitto) -> None:
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    async with (
+        hearing(mosquitto) as skin,
+        aiomqtt.Client(mosquitto.host, mosquitto.port) as node,
+    ):
+        await node.publish(
+            "skin/robot/nodes/main/info", b'{"schema":"skin.info/2"}', 1, retain=True
+        )
+        await until(lambda: skin.unreadable)
+        with pytest.raises(BrokerError) as refused:
+            await skin.info(0.1)
+        assert 'skin/robot/nodes/main/info: info: schema "skin.info/2"' in str(refused.value)
+        async with publishing(mosquitto) as publisher:
+            publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
+            await until(lambda: skin.info_error == "")
+
+
 @pytest.mark.parametrize("protocol", ["5", "3.1.1"])
 async def test_a_command_returns_its_result(mosquitto: Mosquitto, protocol: Any) -> None:
     async with publishing(mosquitto, protocol=protocol):
@@ -455,7 +481,7 @@ async def test_a_command_goes_to_a_node_of_which_the_broker_keeps_nothing(
 ) -> None:
     async with hearing(mosquitto) as skin:
         with pytest.raises(CommandError, match='no answer to "calibrate" from node "main"'):
-            await skin.command("calibrate", node="main", timeout_s=PATIENCE_S)
+            await skin.command("calibrate", node="main", timeout_s=1.0)
 
 
 @pytest.mark.parametrize(
@@ -715,7 +741,7 @@ async def test_callbacks_hear_the_same_from_a_thread_of_their_own(mosquitto: Mos
 
 
 async def test_a_callback_that_would_wait_for_messages_is_told_so(mosquitto: Mosquitto) -> None:
-    """It holds up the thread that receives them: it would wait for ever."""
+    """All other callbacks would wait meanwhile, those that stop a motor, too."""
 
     def use() -> list[object]:
         told: list[object] = []
@@ -746,6 +772,78 @@ async def test_a_callback_that_would_wait_for_messages_is_told_so(mosquitto: Mos
         told = await asyncio.to_thread(use)
     refusal = "a callback cannot wait for messages; ask in another thread"
     assert told == [[1], *4 * [refusal]]
+
+
+async def test_a_slow_callback_holds_up_no_message_and_another_callback_only_once(
+    mosquitto: Mosquitto,
+) -> None:
+    called: list[Any] = []
+    gate, left = threading.Event(), threading.Event()
+
+    def slow(seen: Any) -> None:
+        called.append(seen)
+        assert gate.wait(PATIENCE_S)
+
+    def use() -> None:
+        with SkinCallbacks(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="robot") as skin:
+            skin.on_frame(slow)
+            skin.on_contact(called.append)
+            skin.on_touch(print)
+            skin.ready()
+            for seq in range(1, 6):
+                do(lambda seq=seq: publisher.put_frame(frame(seq)))
+                done_by = time.monotonic() + PATIENCE_S
+                while not called and time.monotonic() < done_by:
+                    time.sleep(0.01)
+            do(lambda: publisher.put_contact("palm", "ON"))
+            do(lambda: publisher.put_touch(touch(1)))
+            while not skin.present():  # it is received while the first call lasts
+                time.sleep(0.01)
+            assert len(called) == 1
+            gate.set()
+            while not any(isinstance(one, Contact) for one in called):
+                time.sleep(0.01)
+        left.set()
+
+    def do(what: Callable[[], object]) -> None:
+        async def doing() -> None:
+            what()
+
+        asyncio.run_coroutine_threadsafe(doing(), loop).result(PATIENCE_S)
+
+    loop = asyncio.get_running_loop()
+    async with publishing(mosquitto) as publisher:
+        await asyncio.wait_for(asyncio.to_thread(use), PATIENCE_S)
+    assert Contact("palm", "ON") in called[:3]
+
+
+async def test_who_leaves_waits_for_the_callback_that_runs(mosquitto: Mosquitto) -> None:
+    called: list[int] = []
+    running, leaving = threading.Event(), threading.Event()
+
+    def slow(_: Touch) -> None:
+        running.set()
+        assert leaving.wait(PATIENCE_S)
+        called.append(len(skin.present()))
+
+    def use(ready: threading.Event) -> list[int]:
+        nonlocal skin
+        with SkinCallbacks(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="robot") as skin:
+            skin.on_touch(slow)
+            skin.ready()
+            ready.set()
+            assert running.wait(PATIENCE_S)
+            threading.Timer(0.1, leaving.set).start()
+        return list(called)
+
+    skin: SkinCallbacks
+    async with publishing(mosquitto) as publisher:
+        ready = threading.Event()
+        user = asyncio.create_task(asyncio.to_thread(use, ready))
+        await asyncio.to_thread(ready.wait, PATIENCE_S)
+        publisher.put_touch(touch(1))
+        publisher.put_touch(touch(2))
+        assert await user == [1]
 
 
 @pytest.mark.parametrize("error", [SystemExit, asyncio.CancelledError])

@@ -18,9 +18,10 @@ from skin_host.client import (
     SkinError,
     WrongCommandError,
 )
+from skin_host.client.streams import ENDED, UNENTERED
 from tests.client.test_client import hearing, publishing, take, touch
 from tests.support.broker import Mosquitto
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, until
 
 #: They would be filters of other topics, no topics at all, or topics that no part has.
 IMPOSSIBLE = ("palm#", "#", "+", "arm/palm", "", "palm\n", "\udc80", "x" * 65)
@@ -99,6 +100,31 @@ async def test_a_client_is_used_in_the_event_loop_in_which_it_was_entered(
         assert [one.count for one in await take(touches, 1)] == [1]
 
 
+async def test_a_client_is_used_while_it_is_entered(mosquitto: Mosquitto) -> None:
+    """Nothing is waited for in vain, and what was true last is not returned as if it were now."""
+    skin = SkinClient(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="robot")
+
+    async def refusals(*more: Callable[[], Any]) -> set[str]:
+        found = set()
+        asked = partial(skin.command, "status")
+        for use in (skin.ready, skin.info, asked, skin.present, *more):
+            with pytest.raises(RequestError) as refused:
+                await asyncio.wait_for(use(), PATIENCE_S)
+            found.add(str(refused.value))
+        return found
+
+    contacts = skin.contacts()
+    before = await refusals(contacts.__anext__)
+    assert before == {UNENTERED}
+    async with publishing(mosquitto) as publisher, skin:
+        publisher.put_contact("palm", "OFF")
+        assert (await take(contacts, 1))[0].state == "OFF"
+        await until(lambda: skin.nodes["main"].online)
+    after = await refusals(skin.contacts, skin.touches)
+    assert after == {ENDED}
+    assert skin.nodes["main"].online is None
+
+
 async def test_a_client_is_entered_once(mosquitto: Mosquitto) -> None:
     async with hearing(mosquitto) as skin:
         with pytest.raises(RequestError, match="entered before: make another one"):
@@ -126,7 +152,7 @@ def test_callbacks_are_used_while_they_are_entered(mosquitto: Mosquitto) -> None
     assert refusals() == {"these callbacks were not entered: use them in their `with` block"}
     with skin:
         skin.ready()
-    assert refusals() == {"these callbacks have ended: nothing is received any more"}
+    assert refusals() == {ENDED}
     with pytest.raises(RequestError, match="entered before: make other ones"):
         skin.__enter__()
 
@@ -152,7 +178,7 @@ def test_who_asks_while_callbacks_end_is_refused_and_does_not_wait_for_ever(
             skin.ready()
         for thread in threads:
             thread.join(PATIENCE_S)
-        assert refused == ["these callbacks have ended: nothing is received any more"] * len(uses)
+        assert refused == [ENDED] * len(uses)
 
 
 def test_all_that_the_client_raises_can_be_caught_by_what_it_exports() -> None:

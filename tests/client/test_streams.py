@@ -1,5 +1,7 @@
 """A stream says what it did not hear."""
 
+import asyncio
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -9,7 +11,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skin_host.client.heard import Contact, Described, Health
-from skin_host.client.streams import HELD, HELD_TAXELS, Stream
+from skin_host.client.streams import HELD, HELD_TAXELS, LATE_S, Stream
+from skin_host.clock import SteppedClock
 from skin_host.fingertip.events import Over
 from skin_host.mqtt.messages import Frame
 from skin_host.processing.events import Touch
@@ -33,9 +36,9 @@ def touch(count: int, t_ns: int | None = None, part: str = "palm") -> Touch:
     )
 
 
-def frame(seq: int, t_ns: int | None = None) -> Frame:
-    mask = np.zeros(1, np.bool_)
-    return Frame("palm", seq, seq if t_ns is None else t_ns, np.zeros(1), mask, mask)
+def frame(seq: int, t_ns: int | None = None, part: str = "palm", taxels: int = 1) -> Frame:
+    mask = np.zeros(taxels, np.bool_)
+    return Frame(part, seq, seq if t_ns is None else t_ns, np.zeros(taxels), mask, mask)
 
 
 async def heard(stream: Stream[Touch]) -> list[tuple[int, int]]:
@@ -207,37 +210,74 @@ async def test_events_that_are_not_counted_are_all_heard() -> None:
     assert await heard(stream) == [(0, 0), (0, 0)]
 
 
-@pytest.mark.parametrize("kind", ["contact", "health"])
-async def test_a_slow_reader_gets_the_newest_state_of_each_part(kind: Any) -> None:
+async def test_a_slow_reader_gets_the_newest_state_of_each_part() -> None:
     """However often that of another part changes meanwhile."""
-    stream: Stream[Contact | Health] = Stream(None, kind)
-
-    def state(part: str, number: int) -> Contact | Health:
-        if kind == "health":
-            return Health(part, {"rate_hz": float(number)})
-        return Contact(part, ("OFF", "ON")[number % 2])
-
+    stream: Stream[Health] = Stream(None, "health")
+    n = 2 * HELD["health"]
     last = {}
-    for part, number in [("palm", 0), ("palm", 1), *(("foot", n) for n in range(2 * HELD[kind]))]:
-        last[part] = state(part, number)
+    for part, number in [("palm", 0), ("palm", 1), *(("foot", n) for n in range(n))]:
+        last[part] = Health(part, {"rate_hz": float(number)})
         stream.put(last[part])
-    assert len(stream._items) == HELD[kind]
+    assert len(stream._items) == HELD["health"]
     stream.close()
     items = [item async for item in stream]
     assert {item.part: item for item in items} == last
     assert [item.part for item in items].index("palm") == 0  # in the order in which they came
 
 
+STATES = [
+    *(Contact(part, state) for part in ("palm", "foot") for state in ("OFF", "ON")),
+    *(Contact("palm", "UNKNOWN", why) for why in ("stale", "not_felt")),
+]
+
+
+@given(st.lists(st.one_of(st.none(), st.sampled_from(STATES)), max_size=40))
+def test_a_slow_reader_never_takes_a_part_for_untouched_that_is_not_any_more(
+    steps: list[Contact | None],
+) -> None:
+    """It reads now and then (None), and learns of all that was touched, or not known."""
+    stream: Stream[Contact] = Stream(None, "contact")
+    now: dict[str, Contact] = {}
+    read: list[Contact] = []
+
+    async def read_one() -> None:
+        seen = await anext(stream)
+        assert seen.touched or seen == now[seen.part]
+        read.append(seen)
+
+    async def read_slowly() -> None:
+        for state in steps:
+            if state is not None:
+                now[state.part] = state
+                stream.put(state)
+            elif stream._items:
+                await read_one()
+        while stream._items:
+            await read_one()
+
+    def touched(part: str, states: list[Contact]) -> list[Contact]:
+        mine = [one for one in states if one.part == part and one.touched]
+        return [one for one, _ in groupby(mine)]
+
+    asyncio.run(read_slowly())
+    assert {one.part: one for one in read} == now
+    for part in now:
+        assert touched(part, read) == touched(part, [one for one in steps if one])
+
+
 @given(st.lists(st.sampled_from("abcdef"), max_size=60))
 def test_the_newest_state_of_each_part_is_held_while_there_is_room(parts: list[str]) -> None:
-    stream: Stream[Health] = Stream(None, "health")
-    stream._most = 6
-    last = {}
-    for number, part in enumerate(parts):
-        last[part] = Health(part, {"rate_hz": float(number)})
-        stream.put(last[part])
-        assert len(stream._items) <= 6
-    assert {item.part: item for item in stream._items} == last
+    async def put() -> None:
+        stream: Stream[Health] = Stream(None, "health")
+        stream._most = 6
+        last = {}
+        for number, part in enumerate(parts):
+            last[part] = Health(part, {"rate_hz": float(number)})
+            stream.put(last[part])
+            assert len(stream._items) <= 6
+        assert {item.part: item for item in stream._items} == last
+
+    asyncio.run(put())
 
 
 async def test_descriptions_of_ever_other_parts_do_not_add_up() -> None:
@@ -263,6 +303,77 @@ async def test_kinds_of_events_have_numbers_of_their_own_and_stay_in_order() -> 
     stream.close()
     seen = [(type(event).__name__, event.count, event.missed) async for event in stream]
     assert seen == [("Touch", 7, 0), ("Over", 1, 0), ("Touch", 8, 0), ("Over", 4, 2)]
+
+
+def test_a_slow_reader_of_frames_never_gets_old_ones() -> None:
+    """At 20 frames a second, of which it reads five."""
+    clock = SteppedClock()
+
+    async def read() -> None:
+        stream: Stream[Frame] = Stream(None, "frame")
+        seen = 0
+        for seq in range(1, 401):
+            stream.put(frame(seq), 7)
+            await clock.sleep(0.05)
+            if seq % 4 == 0:
+                read = await anext(stream)
+                assert (seq - read.seq) * 0.05 <= LATE_S
+                seen += 1 + read.missed
+                assert seen == read.seq  # what was left out is counted
+
+    with clock.runner() as runner:
+        runner.run(read())
+
+
+def test_who_returns_to_frames_reads_the_newest_of_each_part_that_is_received() -> None:
+    clock = SteppedClock()
+
+    async def read() -> list[tuple[str, int, int]]:
+        stream: Stream[Frame] = Stream(None, "frame")
+        for seq in range(1, 11):
+            stream.put(frame(seq), 7)
+            stream.put(frame(seq, part="foot"), 7)
+        stream.put(frame(1, part="gone"), 7)
+        await clock.sleep(60.0)
+        for seq in range(11, 14):
+            stream.put(frame(seq), 7)
+            stream.put(frame(seq, part="foot"), 7)
+        stream.close()
+        return [(one.part, one.seq, one.missed) async for one in stream]
+
+    with clock.runner() as runner:
+        assert runner.run(read()) == [("palm", 13, 12), ("foot", 13, 12)]
+
+
+def test_who_is_late_reads_the_newest_health_of_each_part_however_old_it_is() -> None:
+    clock = SteppedClock()
+
+    async def read() -> list[Health]:
+        stream: Stream[Health] = Stream(None, "health")
+        for number in range(10):
+            for part in ("palm", "foot"):
+                stream.put(Health(part, {"rate_hz": float(number)}))
+            await clock.sleep(1.0)
+        await clock.sleep(60.0)
+        first = await anext(stream)
+        stream.put(Health("palm", {"state": "ok"}))
+        stream.close()
+        return [first, *[one async for one in stream]]
+
+    with clock.runner() as runner:
+        assert runner.run(read()) == [
+            Health("palm", {"rate_hz": 9.0}),
+            Health("foot", {"rate_hz": 9.0}),
+            Health("palm", {"state": "ok"}),
+        ]
+
+
+async def test_frames_of_very_many_taxels_are_held_only_so_far_and_counted() -> None:
+    stream: Stream[Frame] = Stream(None, "frame")
+    for seq in range(1, 101):
+        stream.put(frame(seq, taxels=100_000), 7)
+    assert sum(len(item.valid) for item in stream._items) == HELD_TAXELS
+    assert (await anext(stream)).missed == 100 - HELD_TAXELS // 100_000
 
 
 async def test_touches_of_very_many_taxels_are_held_only_so_far_and_counted() -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 from hypothesis import given
@@ -9,6 +10,8 @@ from hypothesis import strategies as st
 from msgspec import json
 
 from skin_host.mqtt import messages
+from skin_host.mqtt.frames import decode_frame
+from skin_host.mqtt.info import decode_info
 from skin_host.mqtt.payload import MAX_BYTES, MessageError
 from tests.support.said import make_event
 
@@ -29,6 +32,29 @@ def test_too_large_a_message_is_refused_in_few_words(
     with pytest.raises(MessageError) as refusal:
         decode(b" " * (MAX_BYTES + 1))
     assert len(str(refusal.value)) < 80
+
+
+@pytest.mark.parametrize(
+    ("what", "decode"),
+    [
+        ("touch", messages.decode_touch),
+        ("slip", messages.decode_slip),
+        ("over", messages.decode_over),
+        ("health", messages.decode_health),
+        ("frame", partial(decode_frame, "palm")),
+        ("info", decode_info),
+    ],
+)
+def test_a_message_of_a_later_version_is_refused_as_that(
+    what: str, decode: Callable[[bytes], object]
+) -> None:
+    """Whoever reads that a value is invalid would look for a fault of the robot."""
+    later = {"schema": f"skin.{what}/2", "seq": 1, "t_ns": 1, "unit": "kPa", "scale": 0.01}
+    with pytest.raises(MessageError) as refusal:
+        decode(json.encode(later | {"values": [], "valid": ""}))
+    assert str(refusal.value).startswith(
+        f'{what}: schema "skin.{what}/2"; this program reads skin.{what}/1: it needs the version of'
+    )
 
 
 def test_a_touch_has_the_keys_of_the_contract() -> None:

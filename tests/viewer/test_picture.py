@@ -86,8 +86,9 @@ def test_a_page_expects_frames_as_often_as_they_are_published() -> None:
         made = Picture()
         take_nodes(made, {"main": (True, replace(info({"palm": 3}), frame_hz=frame_hz))})
         layout = msgspec.json.decode(made.news(Cursor(), NOW_S)[0])
-        found[frame_hz] = layout["parts"][0]["period_ms"]
-    assert found == {0.0: 50, 100.0: 50, 0.5: 2000}
+        part = layout["parts"][0]
+        found[frame_hz] = part["period_ms"], part["thinned"]
+    assert found == {0.0: (50, False), 100.0: (50, False), 0.5: (2000, True)}
 
 
 def texts(news: list[bytes | str]) -> dict[str, Any]:

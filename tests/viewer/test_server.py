@@ -5,11 +5,12 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
 from socket import AF_INET6, create_server, gethostname
 from typing import Any
 
+import aiomqtt
 import msgspec
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from mcap.reader import make_reader
 from msgspec.structs import replace
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
+from websockets.typing import Origin
 
 from skin_host.client.links import RETAINED_S
 from skin_host.config.settings import Mqtt, load
@@ -385,6 +387,43 @@ async def test_a_full_folder_of_recordings_takes_no_more(
         assert "move some away" in (await heard(socket, of_type("answer")))["error"]
 
 
+async def test_without_a_broker_nothing_is_asked_of_a_robot_and_a_recording_is_still_ended(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """A calibration that waits for the broker would begin at a time that nobody expects."""
+    asked: list[str] = []
+
+    async def note(name: str, payload: bytes) -> Mapping[str, Any]:
+        asked.append(name)
+        return await answer(name, payload)
+
+    viewer = Viewer(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="demo", recordings=tmp_path)
+    async with (
+        node(mosquitto, skin(), note) as publisher,
+        viewer.serving(port=0) as url,
+        page(url) as socket,
+    ):
+
+        async def wish(do: str) -> Any:
+            await socket.send(msgspec.json.encode({"do": do, "node": "main"}).decode())
+            return await heard(socket, of_type("answer"))
+
+        await heard(socket, of_type("layout"))
+        assert (await wish("record"))["ok"]
+        mosquitto.kill()
+        await heard(socket, lambda m: of_type("status")(m) and not m["connected"])
+        for do in ("calibrate", "raw", "record"):
+            assert "no broker at" in (await wish(do))["error"]
+        assert (await wish("mark"))["result"] == {"marks": 1}
+        viewer._client = None  # the client is being made again
+        assert (await wish("mark"))["result"] == {"marks": 2}
+        assert (await wish("stop"))["result"]["marks"] == 2
+        mosquitto.start()
+        await until(lambda: publisher.counters.connected)
+        await heard(socket, lambda m: of_type("status")(m) and m["connected"])
+    assert asked == []
+
+
 async def test_a_page_without_leave_may_not(mosquitto: Mosquitto) -> None:
     broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
     async with (
@@ -475,6 +514,18 @@ async def test_a_page_that_takes_nothing_gives_its_place_to_another(
     assert not [one for one in caplog.messages if "page" in one]
 
 
+async def test_pages_that_sleep_do_not_hold_up_the_end() -> None:
+    viewer = Viewer(nowhere(), robot="demo")
+    async with AsyncExitStack() as stack:
+        url = await stack.enter_async_context(viewer.serving(port=0))
+        asleep = await connect(url.replace("http", "ws") + "live", origin=Origin(url.rstrip("/")))
+        await heard(asleep, of_type("status"))
+        asleep.transport.pause_reading()
+        async with asyncio.timeout(5.0):
+            await stack.aclose()
+        asleep.transport.abort()
+
+
 async def test_a_broker_that_comes_late_is_found(mosquitto: Mosquitto) -> None:
     mosquitto.kill()
     broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
@@ -483,6 +534,20 @@ async def test_a_broker_that_comes_late_is_found(mosquitto: Mosquitto) -> None:
         await heard(socket, lambda m: isinstance(m, dict) and m.get("connected") is True)
         async with node(mosquitto, skin()):
             await heard(socket, of_type("layout"))
+
+
+async def test_a_page_gets_why_a_node_is_not_described(mosquitto: Mosquitto) -> None:
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with (
+        aiomqtt.Client(mosquitto.host, mosquitto.port) as later,
+        Viewer(broker, robot="demo").serving(port=0) as url,
+        page(url) as socket,
+    ):
+        await later.publish("skin/demo/nodes/main/info", b'{"schema":"skin.info/2"}', retain=True)
+        told = await heard(socket, lambda m: of_type("status")(m) and "skin.info/2" in m["error"])
+        assert told["connected"]
+        async with node(mosquitto, skin()):
+            await heard(socket, lambda m: of_type("status")(m) and not m["error"])
 
 
 async def test_who_waits_for_a_robot_is_told_what_to_start_and_the_log_once(

@@ -41,12 +41,13 @@ function connect() {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   socket = new WebSocket(`${scheme}://${location.host}/live`);
   socket.binaryType = "arraybuffer";
-  socket.onopen = () => { link = "open"; if (map.raw) askRaw(); };
+  socket.onopen = () => { link = "open"; };
   socket.onmessage = ({ data }) => take(data);
   socket.onclose = () => {
     link = "lost";
     dirty = true;
     store.lose(performance.now());
+    store.status = { ...store.status, connected: false };
     if (calibrating) say("The page lost its server: health shows whether the skin was calibrated.", 15000, "warn");
     calibrating = null;
     setTimeout(connect, 1000);
@@ -69,8 +70,11 @@ function take(data) {
     showChosen();
     document.title = `${message.robot} skin`;
     $("robot").textContent = message.robot;
-  } else if (message.type === "status") store.status = message;
-  else if (message.type === "contacts") {
+  } else if (message.type === "status") {
+    const isBack = message.connected && !store.status.connected;
+    store.status = message;
+    if (isBack && map.raw) askRaw();
+  } else if (message.type === "contacts") {
     const part = store.part(message.part);
     if (part) part.takeContacts(message, performance.now());
   } else if (message.type === "health") store.takeHealth(message, performance.now());
@@ -128,10 +132,10 @@ function nodesShown() { return [...new Set(map.parts.map((part) => part.node))];
 /** Whether a node takes commands, as far as is known. */
 function takesCommands(node) { return Boolean(store.nodes[node]?.commands) && store.status.nodes[node] !== false; }
 
-function mayCommand() { return store.status.commands && nodesShown().some(takesCommands); }
+function mayCommand() { return link === "open" && store.status.connected && store.status.commands && nodesShown().some(takesCommands); }
 
 function setRaw(on) {
-  if (on && !mayCommand()) return say("Raw values are sent on request, and commands are not allowed here.", 4000);
+  if (on && !mayCommand()) return say("Raw values are sent on request, which no node takes from this page now.", 4000);
   map.raw = on;
   peaks = [];
   $("show-raw").setAttribute("aria-pressed", String(on));
@@ -156,7 +160,7 @@ function refuseRaw({ node, error }) {
   setRaw(false);
 }
 
-setInterval(() => { if (map.raw) askRaw(); }, RAW_AGAIN_MS);
+setInterval(() => { if (map.raw && mayCommand()) askRaw(); }, RAW_AGAIN_MS);
 
 /** Open a dialog; whether it was confirmed. */
 async function asked(dialog) {
@@ -300,11 +304,11 @@ function showStatus(nowMs) {
   let [text, level] = ["", "ok"];
   if (link !== "open") [text, level] = [link === "lost" ? "this page has lost its server; trying again" : "connecting", link === "lost" ? "alarm" : "wait"];
   else if (!store.status.connected) [text, level] = [store.status.error || "connecting", "alarm"];
-  else if (!store.parts.length) [text, level] = ["no node has published what it is: is `skin run` running?", "wait"];
+  else if (!store.parts.length) [text, level] = [store.status.error || "no node has published what it is: is `skin run` running?", store.status.error ? "alarm" : "wait"];
   else if (offline) [text, level] = [`node ${offline} is offline`, "alarm"];
   else if (stale.length) [text, level] = [staleText(stale), "alarm"];
   else if (unknown) [text, level] = [`not known whether node ${unknown} is online`, "wait"];
-  else text = `live, ${inTaxels(store.parts.reduce((sum, part) => sum + part.n, 0))}`;
+  else text = `live, ${inTaxels(store.parts.reduce((sum, part) => sum + part.feeling, 0))}`;
   status.dataset.level = level;
   if (status.textContent !== text) status.textContent = text;
   const banner = $("banner");

@@ -321,8 +321,9 @@ export class SkinMap {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     this.body?.draw(solid, { width, height, ratio: this.ratio, scale: this.scale, raw: this.raw, top: this.top, nowMs });
     for (const at of this.placed ?? []) this.drawPart(ctx, look, at, nowMs);
+    const labels = (this.placed ?? []).flatMap((at) => this.drawContacts(ctx, look, at, nowMs));
     this.labels = [];
-    for (const at of this.placed ?? []) this.drawContacts(ctx, look, at, nowMs);
+    for (const label of labels.sort((a, b) => b.marked - a.marked)) this.drawLabel(ctx, look, label);
     this.drawMarks(ctx, look);
   }
 
@@ -440,8 +441,10 @@ export class SkinMap {
     }
   }
 
+  /** Draw the contacts of a part; returns their labels, which stand above all outlines. */
   drawContacts(ctx, look, { part, dx, dy }, nowMs) {
-    if (part.stale(nowMs)) return;
+    if (part.stale(nowMs)) return [];
+    const labels = [];
     const pose = this.poses.get(part.name);
     for (const contact of part.contacts) {
       const seen = contact.taxels.filter((i) => i < part.n);
@@ -452,7 +455,7 @@ export class SkinMap {
       hull.forEach(([x, y], i) => { if (i) ctx.lineTo(x, y); else ctx.moveTo(x, y); });
       ctx.closePath();
       // Of a contact on the far side there is a faint outline, and its force.
-      ctx.globalAlpha = seen.some((i) => pose.towards[i] >= 0) ? 1 : 0.45;
+      const alpha = ctx.globalAlpha = seen.some((i) => pose.towards[i] >= 0) ? 1 : 0.45;
       const marked = is(this.pointed, part, contact) || is(this.selected, part, contact);
       halo(ctx, look, marked ? 4 : 2, marked);
       let [cx, cy] = [0, 1].map((k) => hull.reduce((sum, p) => sum + p[k], 0) / hull.length);
@@ -464,13 +467,14 @@ export class SkinMap {
         ctx.moveTo(cx, cy - 6); ctx.lineTo(cx, cy + 6);
         halo(ctx, look, 2);
       }
-      this.drawLabel(ctx, look, hull, [cx, cy], `#${contact.id}  ${told(contact.force_n, contact.force_n < 10 ? 2 : 1, "N", isBound(contact))}`);
+      labels.push({ hull, at: [cx, cy], alpha, marked, text: `#${contact.id}  ${told(contact.force_n, contact.force_n < 10 ? 2 : 1, "N", isBound(contact))}` });
       ctx.globalAlpha = 1;
     }
+    return labels;
   }
 
-  /** Words beside an outline, on the side where there is room and no other words are. */
-  drawLabel(ctx, look, hull, [cx, cy], text) {
+  /** Words beside an outline, on the side where there is room and no other words are. Those that find none stand in the table alone, but for a contact that is marked. */
+  drawLabel(ctx, look, { hull, at: [cx, cy], alpha, marked, text }) {
     ctx.font = FONT;
     const wide = ctx.measureText(text).width;
     const [xs, ys] = [0, 1].map((k) => hull.map((p) => p[k]));
@@ -478,8 +482,11 @@ export class SkinMap {
     const places = [[right + 6, cy - 9], [left - 6 - wide, cy - 9], [cx - wide / 2, top - 21], [cx - wide / 2, bottom + 3]];
     const free = ([x, y]) => x > 0 && y > 0 && x + wide < this.canvas.clientWidth && y + 18 < this.canvas.clientHeight
       && this.labels.every(([ox, oy, ow]) => x > ox + ow || ox > x + wide || y > oy + 18 || oy > y + 18);
-    const [x, y] = places.find(free) ?? places[0];
+    const place = places.find(free) ?? (marked ? places[0] : null);
+    if (!place) return;
+    const [x, y] = place;
     this.labels.push([x, y, wide]);
+    ctx.globalAlpha = alpha;
     ctx.textAlign = "left";
     ctx.textBaseline = "middle";
     ctx.lineWidth = 4;
@@ -487,6 +494,7 @@ export class SkinMap {
     ctx.strokeText(text, x, y + 9);
     ctx.fillStyle = look.text;
     ctx.fillText(text, x, y + 9);
+    ctx.globalAlpha = 1;
   }
 
   drawMarks(ctx, look) {

@@ -181,7 +181,7 @@ export function showHealth(box, list, parts, nowMs) {
 /** What a group of parts sends together. */
 function rates(parts, nowMs) {
   const sum = (of) => parts.reduce((all, part) => all + of(part), 0);
-  const taxels = sum((part) => part.health?.taxels ?? part.n);
+  const taxels = sum((part) => part.health?.taxels ?? part.feeling);
   const known = parts.map((part) => part.valids(nowMs));
   const valid = known.includes(null) ? "?" : known.reduce((all, n) => all + n, 0);
   return `${sum((part) => part.rate(nowMs)).toFixed(0)} frames/s, ${valid} of ${taxels} taxels valid`;
@@ -213,8 +213,8 @@ function fill(article, part, once, nowMs) {
   article.dataset.part = part.name;
   put2(head.firstChild, part.name);
   put(head.lastChild, stateOf(part, nowMs));
-  const taxels = `${part.valids(nowMs) ?? "?"} of ${part.health?.taxels ?? part.n} taxels valid`;
-  const frames = part.hasFrames ? `${part.rate(nowMs).toFixed(1)} frames/s, ${part.missed} missed` : "no frames are published";
+  const taxels = `${part.valids(nowMs) ?? "?"} of ${part.health?.taxels ?? part.feeling} taxels valid`;
+  const frames = part.hasFrames ? `${part.rate(nowMs).toFixed(1)} frames/s, ${part.missed} ${part.thinned ? "lost or left out" : "missed"}` : "no frames are published";
   put(rates, part.fingertip ? `${told(stale ? null : part.health?.rate_hz, 0, "samples/s")} of force and torque` : `${frames}, ${taxels}`);
   const sentences = (part.health?.sentences ?? []).filter((says) => !isStated(part, nowMs) || !once.has(says));
   const said = [...ages(part, nowMs, sentences.length ? "; before that:" : "."), ...sentences];

@@ -31,8 +31,10 @@ export class Part {
     this.fingertip = Boolean(info.fingertip); // on a force/torque board: it has no taxels
     this.n = info.pads.length;
     this.hasFrames = !this.fingertip && info.frames !== false;
+    this.thinned = Boolean(info.thinned); // frames are left out on purpose
     this.periodMs = this.hasFrames ? info.period_ms : HEALTH_PERIOD_MS;
     this.thermal = info.pads.map((pad) => pad === "thermal");
+    this.feeling = this.thermal.filter((one) => !one).length; // pads that feel pressure, as health counts taxels
     this.position = info.position_m.map((p) => p.map((x) => x * 1e3));
     this.normal = info.normal;
     this.radius = info.radius_mm;

@@ -566,6 +566,30 @@ async def test_raw_values_stay_while_any_node_sends_them(
         await seen.until('document.getElementById("banner").textContent === "no"')
 
 
+async def test_without_a_broker_nothing_is_asked_and_raw_values_come_back_with_it(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """Nobody calibrates a robot that is out of reach, and finds it calibrated later."""
+    async with served(mosquitto, tmp_path / "p", RAW_SERVER) as seen:
+        await seen.run("""(() => {
+            window.asked = [];
+            window.sockets.at(-1).send = text => asked.push(JSON.parse(text).do);
+            window.linked = connected => say("status",
+                { connected, commands: true, error: "", nodes: { main: true } });
+        })()""")
+        await seen.click_on('document.getElementById("show-raw")')
+        await seen.run("linked(false)")
+        await seen.until('document.getElementById("calibrate").disabled')
+        assert await seen.run(RAW)
+        assert await seen.run("asked") == ["raw"]
+        await seen.run("linked(true)")
+        await seen.until('!document.getElementById("calibrate").disabled')
+        assert await seen.run(RAW)
+        assert await seen.run("asked") == ["raw", "raw"]
+        await seen.run("lose()")
+        await seen.until('document.getElementById("calibrate").disabled')
+
+
 #: Two of them, of a node that sends raw values: the byte of each, and its bits.
 RAW_SERVER = (
     PARTS
@@ -612,6 +636,57 @@ async def test_the_words_at_the_scale_of_raw_values_stand_apart(
             .map(tick => tick.getBoundingClientRect()).map(box => [box.left, box.right])""")
         assert len(boxes) > 2
         assert all(one[1] < other[0] for one, other in pairwise(boxes)), boxes
+
+
+async def test_the_words_at_many_contacts_stand_apart_and_the_selected_one_has_its_own(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    async with served(mosquitto, tmp_path / "p") as seen:
+        await seen.run("""setInterval(() => {
+            pressed(0, 0);
+            contacts("palm", "ON", null, Array.from({ length: 12 }, (_, i) => ({
+                id: i + 1, taxels: [0], centroid_m: null, force_n: 1.5, peak_kpa: 3,
+                area_mm2: 20, partial: false, beyond: false, verdict: null,
+            })));
+        }, 50)""")
+        words = "window.labels.filter(([text]) => text.startsWith('#'))"
+        labels = await seen.until(f"({words}.length > 1 && {words})")
+        for i, (_, x, y, wide) in enumerate(labels):
+            for _, other_x, other_y, other_wide in labels[:i]:
+                apart = x > other_x + other_wide or other_x > x + wide or abs(y - other_y) >= 18
+                assert apart, labels
+        assert "#12  1.50 N" not in [text for text, *_ in labels]
+        await seen.click_on('document.querySelectorAll("#contacts tbody tr")[11]')
+        await seen.until(f"{words}[0]?.[0] === '#12  1.50 N'")
+
+
+#: A part that publishes touches alone, with a pad that measures temperature, and one with frames.
+THINNED = (
+    PARTS
+    + """
+    const two = { pads: ["pressure", "thermal"], position_m: [[0, 0, 0], [0.01, 0, 0]],
+                  normal: [[0, 0, 1], [0, 0, 1]], radius_mm: [2, 2], area_mm2: [20, 0],
+                  frames: false, thinned: true };
+    window.layOut = (version, parts) => say("layout", { version, robot: "r", nodes: {}, parts });
+    window.palm = [part("palm", two)];
+    window.wrist = [part("wrist", { thinned: true })];
+    say("status", { connected: true, commands: true, error: "", nodes: { main: true } });
+    return true;
+})()"""
+)
+
+
+async def test_pads_that_feel_no_pressure_are_no_taxels_and_frames_left_out_are_not_missed(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    async with served(mosquitto, tmp_path / "p", THINNED) as seen:
+        await seen.run("""layOut(11, palm); say("contacts", {
+            part: "palm", state: "OFF", why: null, contacts: [] }); say("health", {
+            part: "palm", age_s: 0, state: "ok", sentences: [], rate_hz: 20, taxels: 1,
+            valid_taxels: 1, triangles: [] })""")
+        await seen.until('document.getElementById("status").textContent === "live, 1 taxel"')
+        await seen.run("layOut(12, wrist)")
+        await seen.until(f"/0 lost or left out, \\? of 1 taxels/.test({HEALTH})")
 
 
 async def test_what_is_at_the_cursor_stands_beside_it_under_a_banner(
