@@ -298,9 +298,11 @@ def _kept(
     if fitted.ratio > DOUBTFUL_RATIO:
         warn(f"{log}: {describe_ratio(fitted.ratio)}")
     if not fitted.unloads:
+        widest_kpa = max(fitted.found.memory.radius_kpa, default=0.0)
+        beyond = f" beyond {widest_kpa:.0f} kPa" if widest_kpa else ""
         warn(
-            f"{log}: the pressure does not go down again for a tenth of the time: the foam's "
-            "hysteresis is not known, and pressures that go down read too high"
+            f"{log}: the pressure does not go down again far enough for a tenth of the time: the "
+            f"foam's hysteresis{beyond} is not known, and pressures that go down read too high"
         )
 
     if before is None:

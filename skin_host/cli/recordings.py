@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from skin_host.config.settings import Settings
     from skin_host.layout import Layout
-    from skin_host.mqtt.address import Broker
     from skin_host.processing.calibration import Calibration
     from skin_host.recording.export import Series
 
@@ -232,19 +231,19 @@ def _record(arguments: argparse.Namespace) -> int:
     file: Path = arguments.file
     if file.exists():
         raise RequestError(f"{file}: is there already; remove it or choose another name")
+    settings = None if arguments.config is None else load_skin(arguments.config)[0]
     if is_mcap(file):
         with Recorder(file) as recorder:
-            told = run(partial(_capture, arguments, recorder, None), arguments.seconds)
+            told = run(partial(_capture, arguments, settings, recorder, None))
             if not recorder.messages:
                 _require_frames(arguments, 0)
         told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
     else:
         can_suffix(file)
-        if arguments.config is None or arguments.broker is not None:
+        if settings is None or arguments.broker is not None:
             raise RequestError(f"{file}: holds CAN frames alone and needs --config; or use .mcap")
-        settings, _ = load_skin(arguments.config)
         with CanLog(file, [bus.channel for bus in settings.buses.values()]) as log:
-            told = run(partial(_capture, arguments, None, log), arguments.seconds)
+            told = run(partial(_capture, arguments, settings, None, log))
             _require_frames(arguments, log.frames)
         told |= {"frames": log.frames}
         told |= {"frames_left_out": log.left_out} if log.left_out else {}
@@ -278,46 +277,67 @@ def _plain(value: Any) -> str:
 
 
 async def _capture(
-    arguments: argparse.Namespace, recorder: Any, log: Any, stop: "asyncio.Event"
+    arguments: argparse.Namespace,
+    settings: "Settings | None",
+    recorder: Any,
+    log: Any,
+    stop: "asyncio.Event",
 ) -> dict[str, Any]:
-    """Record until `stop` is set; report what was lost."""
+    """Record until `stop` is set, or the time is over; report what was lost.
+
+    The time begins when the robot is known and the buses are open.
+
+    Raises:
+        SkinError: it was ended before that.
+    """
     import asyncio
 
+    from skin_host.mqtt.address import Broker
     from skin_host.recording.capture import capture_broker, capture_buses
+    from skin_host.tasks import until
 
     told: dict[str, Any] = {}
+    sources = []
 
-    async def from_broker() -> None:
-        broker, base, robot = await _robot(arguments.broker or LOCAL, arguments.robot)
+    async def from_broker(broker: Broker, base: str, robot: str) -> None:
         told["gaps"] = await capture_broker(recorder, broker, base, robot, stop)
         told["messages_lost"] = recorder.discarded
 
-    async def from_buses() -> None:
-        settings, _ = load_skin(arguments.config)
+    async def from_buses(settings: "Settings") -> None:
         sink = log.put if log is not None else recorder.can
         told["frames_lost"] = await capture_buses(settings, sink, stop)
 
-    sources = []
-    if recorder is not None and (arguments.broker is not None or arguments.config is None):
-        sources.append(from_broker())
-    if arguments.config is not None:
-        sources.append(from_buses())
+    async def for_the_time() -> None:
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), arguments.seconds)
+        stop.set()
+
+    if recorder is not None and (arguments.broker is not None or settings is None):
+        url = arguments.broker or LOCAL
+        broker, base = Broker.from_url(url)
+        robot = await until(stop, _robot(url, arguments.robot))
+        if robot is None:
+            raise SkinError(
+                f"{arguments.file}: ended before a robot was found at {broker}; nothing is recorded"
+            )
+        sources.append(from_broker(broker, base or "skin", robot))
+    if settings is not None:
+        sources.append(from_buses(settings))
     if arguments.seconds is None:
         print("recording; end with Ctrl-C", file=sys.stderr)
     async with contextlib.AsyncExitStack() as stack:
         stack.callback(stop.set)  # one that fails ends the other
-        await asyncio.gather(*sources)
+        # Buses are opened in the first step of theirs, which may take seconds; the time follows.
+        await asyncio.gather(*sources, for_the_time())
     return told
 
 
-async def _robot(url: str, robot: str | None) -> tuple["Broker", str, str]:
-    """Return the broker behind a URL, the base of its topics, and the robot."""
+async def _robot(url: str, robot: str | None) -> str:
+    """Return the name of the robot at a broker."""
     from skin_host.client import SkinClient
-    from skin_host.mqtt.address import Broker
 
-    broker, base = Broker.from_url(url)
     async with SkinClient(url, robot=robot) as skin:
-        return broker, base or "skin", skin.robot
+        return skin.robot
 
 
 def _series(arguments: argparse.Namespace) -> "Series":

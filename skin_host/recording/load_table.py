@@ -68,7 +68,7 @@ def read_table(path: Path) -> LoadTable:
             raise RequestError(f'{path}:{number}: "{line[:60]}" is not finite; {WANTED}')
         if rows and time_s <= rows[-1][0]:
             raise RequestError(
-                f"{path}:{number}: time {time_s:.10g} s follows {rows[-1][0]:.10g} s; {WANTED}"
+                f"{path}:{number}: time {time_s:.16g} s follows {rows[-1][0]:.16g} s; {WANTED}"
             )
         rows.append((time_s, kpa))
     if len(rows) < 2:

@@ -34,7 +34,11 @@ from skin_host.layout import Layout, PadKind, load_skin
 from skin_host.mqtt.contact import PartContact, use_measurements
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration, Verdict, by_part
-from skin_host.processing.calibration.calibrator import NOISE_SAMPLES, PRESSED_UNITS
+from skin_host.processing.calibration.calibrator import (
+    KNOWN_SAMPLES,
+    NOISE_SAMPLES,
+    PRESSED_UNITS,
+)
 from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.core import Engine, Output, Step
 from skin_host.processing.masks import Mask
@@ -254,14 +258,30 @@ def _used_in_both(
 def calibrate_from_log(
     log: Path, settings: Settings, layout: Layout, seconds: float
 ) -> Calibration:
-    """Calibrate on the first `seconds` of a recording, longer only if nothing is known from these.
+    """Calibrate on the first `seconds` of a recording, longer only if too little is known from
+    these.
 
     Raises:
         LogError: unreadable, without a single sweep of this skin, or of boards that send at so
             different a period than configured that nothing of them counts.
     """
+    found = _calibrated(log, settings, layout, seconds, NOISE_SAMPLES)
+    if np.any(found.verdict == Verdict.TOO_FEW):
+        # Frames of slow boards were lost, or the recording begins in the middle of a sweep.
+        found = _calibrated(log, settings, layout, seconds, KNOWN_SAMPLES)
+    return found
+
+
+def _calibrated(
+    log: Path, settings: Settings, layout: Layout, seconds: float, fewest: int
+) -> Calibration:
+    """Calibrate on the first `seconds` of a recording, and `fewest` sweeps of each board.
+
+    Raises:
+        LogError: see `calibrate_from_log`.
+    """
     engine = Engine(settings, layout, list(range(len(layout.parts))))
-    engine.begin_calibration(seconds, NOISE_SAMPLES)
+    engine.begin_calibration(seconds, fewest)
     last_ns = 0
     for output in replay(log, engine):
         last_ns = output.sweeps[-1].t_ns if output.sweeps else last_ns

@@ -1,6 +1,7 @@
 """Commands around recordings that are asked to end leave no half a file, and no lost one."""
 
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -125,3 +126,19 @@ def test_a_recording_under_nohup_goes_on_when_its_terminal_is_closed(tmp_path: P
         running.communicate(timeout=PATIENCE_S)
     assert running.returncode == 0
     assert path.exists()
+
+
+@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
+def test_a_search_for_a_robot_that_is_ended_ends_at_once(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as broker:  # never answers
+        where = f"127.0.0.1:{broker.getsockname()[1]}"
+        path = tmp_path / "a.mcap"
+        with begin("record", str(path), "--broker", f"mqtt://{where}") as running:
+            with broker.accept()[0]:
+                running.send_signal(number)
+                said, err = running.communicate(timeout=PATIENCE_S)
+    wanted = f"{path}: ended before a robot was found at {where}; nothing is recorded"
+    assert (running.returncode, said, err) == (1, "", f"skin record: {wanted}\n")
+    assert not any(tmp_path.iterdir())

@@ -21,6 +21,7 @@ from skin_host.recording.export.known import Gone
 from skin_host.recording.export.scene import ARROW_M_PER_N, POINT, RecordedScene, SkinScene
 from tests.recording.test_export_tables import BEGIN, LOAD, LOST, OVER, SLIP
 from tests.support.rerun import chunks
+from tests.support.waiting import PATIENCE_S
 
 N, TAXELS = 5, 12
 START_NS = 1_700_000_000_000_000_000
@@ -198,6 +199,41 @@ def test_rerun_reads_what_was_exported(series: Series, tmp_path: Path) -> None:
     assert "Transform3D:translation" in seen["/robot/hand"]
     assert {"Scalars:scalars"} <= seen["/force_n/arm"] & seen["/kpa/hand"]
     assert "TextLog:text" in seen["/health"]
+
+
+#: Ends the export of the recording in argv[1] to the file in argv[2], when it is nearly done.
+ENDED = """
+import pickle, sys
+from pathlib import Path
+from skin_host.recording.export import export, scene
+
+show, left = scene.RerunStream.show, 9
+
+def until_ended(self, item):
+    global left
+    left -= 1
+    if not left:
+        raise KeyboardInterrupt
+    show(self, item)
+
+scene.RerunStream.show = until_ended
+export(pickle.loads(Path(sys.argv[1]).read_bytes()), Path(sys.argv[2]))
+"""
+
+
+def test_an_export_for_rerun_that_is_ended_ends(series: Series, tmp_path: Path) -> None:
+    """Rerun waits for a thread that waits for Python when what it has encoded is not read."""
+    pickled, output = tmp_path / "series", tmp_path / "a.rrd"
+    pickled.write_bytes(pickle.dumps(series))
+    done = subprocess.run(
+        [sys.executable, "-c", ENDED, pickled, output],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
+    )
+    assert done.stderr.endswith("KeyboardInterrupt\n")
+    assert not output.exists()
 
 
 def course(reader: Any, entity: str) -> list[float]:

@@ -203,6 +203,35 @@ async def test_what_touched_a_robot_that_is_gone_is_not_known_any_more(
             await until(lambda: shown() == dict.fromkeys(touched, (False, False)))
 
 
+async def test_the_force_on_a_part_is_not_known_from_a_lost_contact_until_nothing_touches_it(
+    mosquitto: Mosquitto,
+) -> None:
+    """However other contacts of the part begin, last and are released meanwhile."""
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    other = msgspec.structs.replace(TOUCH, id=TOUCH.id + 1)
+
+    def shown() -> tuple[int, bool] | None:
+        arrows = [item for item in items if isinstance(item, Arrows)]
+        return (len(arrows[-1].arrows), arrows[-1].is_known) if arrows else None
+
+    settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    async with AsyncExitStack() as stack:
+        robot = await stack.enter_async_context(Publisher(settings, "demo", "main"))
+        robot.put_info(node_info(layout, "main", version="1", configuration="x"))
+        items = await stack.enter_async_context(following(mosquitto))
+        while shown() != (2, True):
+            robot.put_contact("left_hand", "ON")
+            robot.put_touch(TOUCH)
+            robot.put_touch(other)
+            await asyncio.sleep(0.05)
+        robot.put_touch(TOUCH.ended(4, 10**18 + 6, "lost"))
+        await until(lambda: shown() == (1, False))
+        robot.put_touch(other.ended(5, 10**18 + 7, "released"))
+        await until(lambda: shown() == (0, False))
+        robot.put_contact("left_hand", "OFF")
+        await until(lambda: shown() == (0, True))
+
+
 async def test_what_has_no_time_follows_the_rest_by_the_clock_of_the_robot(
     mosquitto: Mosquitto,
 ) -> None:

@@ -4,11 +4,12 @@ import json
 from decimal import Decimal
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from skin_host.cli import main
 from tests.support.broker import Mosquitto
-from tests.support.limbs import HZ, calibrate, ramp, write_config, write_log
+from tests.support.limbs import HZ, PADS, calibrate, ramp, write_config, write_log
 
 
 @pytest.mark.parametrize("period_ms", [10, 20])
@@ -67,6 +68,22 @@ def test_what_is_exported_and_drawn_of_it_comes_with_the_same_warning(
             line.startswith(f"warning: {log}: a sends every 200 ms (configured: 40 ms)")
             for line in slow
         )
+
+
+def test_frames_that_slow_boards_lost_cost_no_pad_its_zero(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of 5 sweeps a second the first seconds have hardly enough."""
+    bench = write_config(tmp_path)
+    log = write_log(tmp_path / "slow.log", np.zeros((round(20 * HZ), 2 * PADS)))
+    lines = log.read_text().splitlines(keepends=True)
+    log.write_text("".join(line for number, line in enumerate(lines) if number % 37))
+    output = tmp_path / "slow.jsonl"
+    words = "replay", log, "--config", bench, "--output", output
+    assert main([str(word) for word in words]) == 0
+    assert capsys.readouterr().err == ""
+    for line in output.read_text().splitlines()[-2:]:
+        assert json.loads(line)["valid_taxels"] == PADS
 
 
 def sped_up(log: Path, late_s: str) -> Path:

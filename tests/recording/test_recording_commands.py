@@ -6,13 +6,19 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
+import can
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from skin_host.bus.opening import open_port
+from skin_host.bus.port import Port
 from skin_host.cli import main
 from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout, load_skin
@@ -211,6 +217,58 @@ async def test_a_robot_is_recorded_until_ctrl_c_and_played_again(
         main, ["replay", str(file), "--onto", "broker", "--broker", url, "--robot", "ghost"]
     )
     assert played == 0
+
+
+async def test_the_time_of_a_recording_begins_when_the_robot_is_found(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    async with connect(Broker(mosquitto.host, mosquitto.port), identifier="robot") as connection:
+        await connection.publish("skin/icub/palm/contact", b"ON", qos=1, retain=True)
+    mosquitto.freeze()
+    url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    options = ["--broker", url, "--robot", "icub", "--seconds", "0.5", "--json"]
+    recording = await asyncio.create_subprocess_exec(
+        *[sys.executable, "-m", "skin_host", "record", str(tmp_path / "a.mcap"), *options],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+    )
+    await until(lambda: list(tmp_path.glob(".a.growing*")))
+    await asyncio.sleep(1.0)  # longer than it records
+    mosquitto.resume()
+    out, _ = await asyncio.wait_for(recording.communicate(), PATIENCE_S)
+    assert json.loads(out)["messages"] == {"contact": 1}
+
+
+def test_the_time_of_a_recording_begins_when_its_buses_are_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A serial adapter takes seconds."""
+
+    def slowly(*arguments: Any) -> Port:
+        time.sleep(0.5)
+        return open_port(*arguments)
+
+    monkeypatch.setattr(capture, "open_port", slowly)
+    group = "239.74.163.50"
+    config = write_config(tmp_path / "skin.toml")
+    live = f'channel = "{group}"\ninterface = "udp_multicast"'
+    config.write_text(config.read_text().replace('channel = "can0"', live))
+    ended = threading.Event()
+
+    def send() -> None:
+        with can.Bus(interface="udp_multicast", channel=group) as bus:
+            while not ended.wait(0.01):
+                bus.send(can.Message(arbitration_id=0x4E4, data=b"@", is_extended_id=False))
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    words = ["record", str(tmp_path / "a.log"), "--config", str(config), "--json"]
+    try:
+        assert main([*words, "--seconds", "0.4"]) == 0
+    finally:
+        ended.set()
+        sender.join()
+    assert json.loads(capsys.readouterr().out)["frames"] > 3
 
 
 async def test_a_robot_that_is_off_is_not_untouched_in_a_recording(

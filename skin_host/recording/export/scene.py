@@ -509,11 +509,16 @@ def write_rerun(series: Series, output: Path) -> None:
     stream = rr.RecordingStream("skin-host")
     # Its own writer of files never ends on a full disk.
     encoded = stream.binary_stream()
-    shown = RerunStream(stream, scene.scene)
-    for item in scene.items():
-        shown.show(item)
+    try:
+        shown = RerunStream(stream, scene.scene)
+        for item in scene.items():
+            shown.show(item)
+    finally:
+        # What is not read is waited for when this is deleted, and never comes: the thread that
+        # brings it waits for Python's lock.
+        data = encoded.read()
     with writing(output):
-        write_atomic(output, encoded.read() or b"")
+        write_atomic(output, data or b"")
 
 
 class RerunStream:

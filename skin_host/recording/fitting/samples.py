@@ -207,6 +207,8 @@ def _gaps_of(
 
 
 def _held(values: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:
-    """Values [t, n] with the last valid one in place of the invalid."""
-    rows = np.where(valid, np.arange(len(values))[:, np.newaxis], 0)
+    """Values [t, n] with the last valid one in place of the invalid, and the first one before it:
+    a recording may begin in the middle of a sweep, and the skin is untouched then.
+    """
+    rows = np.where(valid, np.arange(len(values))[:, np.newaxis], valid.argmax(axis=0))
     return np.take_along_axis(values, np.maximum.accumulate(rows, axis=0), axis=0)

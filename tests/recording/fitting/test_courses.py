@@ -1,6 +1,7 @@
 """What a course of pressure cannot show is not kept: it is refused, or named."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,12 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import load
 from skin_host.daemon.calibrate import calibration_path
-from skin_host.processing.curves import CurveVerdict
+from skin_host.processing.curves import CurveVerdict, Memory
+from skin_host.processing.fitting.memory import loading_kpa
 from skin_host.recording.load_table import LoadTable, read_table, without_spikes
 from tests.support.limbs import (
     ARM,
+    CURVE,
     HZ,
     PADS,
     calibrate,
@@ -50,7 +53,7 @@ def test_a_recording_that_begins_pressed_is_refused_by_what_its_table_shows(
     capsys.readouterr()
     assert calibrate(bench, log, table_of(bench, kpa[begun:])) == 2
     error = capsys.readouterr().err
-    assert "the first 5 s of the recording, of which the zero is taken, are at 40 to 46" in error
+    assert "the first 5 s of the recording, of which the zero is taken, are at 40 to 47" in error
     assert not calibration_path(load(bench), "main").exists()
 
 
@@ -62,7 +65,7 @@ def test_a_recording_that_is_pressed_while_its_zero_is_taken_is_refused(
     begun = round(11.0 * HZ)
     log = write_log(bench.with_name("air.log"), units[begun:])
     assert calibrate(bench, log, table_of(bench, kpa[begun:])) == 2
-    assert "are at 6 to 15 kPa; wanted untouched skin then" in capsys.readouterr().err
+    assert "are at 6 to 16 kPa; wanted untouched skin then" in capsys.readouterr().err
 
 
 def test_a_chamber_that_rests_at_some_kpa_is_named_by_its_unit_and_not_as_a_press(
@@ -118,6 +121,21 @@ def test_the_hysteresis_of_a_foam_that_is_not_let_go_is_not_known(
     assert "pressures that go down read too high" in line
     assert calibrate(bench, log, table, "--json") == 0
     assert json.loads(capsys.readouterr().out)["hysteresis_known"] is False
+
+
+def test_hysteresis_is_known_as_far_as_the_pressure_goes_down(
+    bench: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    corners_s = [0.0, 8.0, 48.0, 53.0, 58.0, 80.0]
+    kpa = np.interp(np.arange(0.0, 80.0, 1.0 / HZ), corners_s, [0.0, 0.0, 80.0, 80.0, 66.0, 66.0])
+    reads_kpa = loading_kpa(kpa, Memory((6.0,), (0.5,)))
+    units = CURVE.units(reads_kpa[:, np.newaxis] * np.ones(2 * PADS))
+    log = write_log(bench.with_name("air.log"), units)
+    assert calibrate(bench, log, table_of(bench, kpa)) == 0
+    answer = capsys.readouterr()
+    (radius,) = re.findall(r"hysteresis of the foam: 0\.\d+ within (\d+) kPa", answer.out)
+    (line,) = answer.err.splitlines()
+    assert f"the foam's hysteresis beyond {radius} kPa is not known" in line
 
 
 def test_pads_that_a_weak_course_does_not_show_keep_their_curves(
@@ -193,6 +211,18 @@ def test_a_board_that_ends_before_its_table_is_named(
     log = without(write_log(bench.with_name("air.log"), units), 60.0, 100.0, addresses="4")
     assert calibrate(bench, log, table) == 2
     assert "board b: nothing of it was received for 32" in capsys.readouterr().err
+
+
+def test_a_recording_that_begins_in_the_middle_of_a_sweep_costs_no_pad_its_curve(
+    bench: Path,
+) -> None:
+    units, table = ramp(bench)
+    log = write_log(bench.with_name("air.log"), units)
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[1:]))
+    assert calibrate(bench, log, table) == 0
+    curves = stored(bench, calibration_path(load(bench), "main")).curves
+    assert curves is not None
+    assert (curves.verdict == CurveVerdict.GOOD).all()
 
 
 def test_a_gap_of_a_board_that_nothing_presses_is_none_of_the_pressure(bench: Path) -> None:
