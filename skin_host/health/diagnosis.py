@@ -12,6 +12,7 @@ from msgspec import Struct
 
 from skin_host.config.settings import format_triangles
 from skin_host.health.record import BoardHealth, BusHealth, Record
+from skin_host.layout import TAXELS_PER_TRIANGLE
 
 #: Frames of unconfigured nodes that take more than this share of a bus are a fault.
 BABBLE_LOAD = 0.4
@@ -79,6 +80,12 @@ _TAXEL_FAULTS = {
 }
 
 
+#: Verdicts of a calibration for which taxels are not valid, in words; the second ones because too
+#: little of them came.
+_REFUSED = {"stuck": "stuck", "out_of_range": "out of range", "too_noisy": "too noisy"}
+_NOT_RECEIVED = {"absent": "absent", "too_few": "received too rarely"}
+
+
 class FoundFault(Struct, frozen=True):
     """A fault.
 
@@ -123,12 +130,14 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[FoundFau
     faults += _triangles(record, silent)
     faults += _taxels(record)
     faults += _part(record)
-    if record["state"] == "degraded" and not silent and not any(map(_invalidates, faults)):
+    unexplained = set(record["invalid"]) - _explained(record)
+    degraded = record["state"] == "degraded" and not silent
+    if degraded and unexplained and not any(map(_hides_many, faults)):
         faults.append(
             FoundFault(
                 "taxel_unproven",
                 record["part"],
-                f"{named(record['invalid'])} of {record['part']}: not valid: the pad failed when "
+                f"{named(unexplained)} of {record['part']}: not valid: the pad failed when "
                 "calibrated under pressure, or jumps",
             )
         )
@@ -141,15 +150,24 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[FoundFau
     return faults
 
 
-def _invalidates(fault: FoundFault) -> bool:
-    """Whether a fault is a reason for which taxels are not valid."""
-    return fault.code.startswith(("bus_", "board_", "triangle_")) or fault.code in {
-        "taxel_stuck",
-        "taxel_noisy",
-        "taxel_out_of_range",
-        "taxel_refused",
-        "taxel_unreached",
-    }
+def _hides_many(fault: FoundFault) -> bool:
+    """Whether a fault is a reason for which taxels are not valid that are not listed one by one."""
+    return fault.code.startswith(("bus_", "board_", "triangle_"))
+
+
+def _explained(record: Record) -> set[int]:
+    """Return the taxels of which a fault is reported for which they are not valid: their own, or
+    that of their temperature pad, which is none of those that measure pressure.
+    """
+    found, verdicts = record["taxel_faults"], record["taxel_verdicts"]
+    kinds = ("unreached", *_REFUSED, *_NOT_RECEIVED)
+    explained = set().union(*(verdicts.get(kind, ()) for kind in kinds))
+    explained.update(*(found.get(kind, ()) for kind in ("out_of_range", "returned")))
+    failed = {taxel for kind in ("stuck", "noisy") for taxel in found.get(kind, ())}
+    for temperature_pad in failed.difference(record["invalid"]):
+        first = temperature_pad - temperature_pad % TAXELS_PER_TRIANGLE
+        explained.update(range(first, first + TAXELS_PER_TRIANGLE))
+    return explained | failed
 
 
 _SILENT = {"bus_off", "bus_down", "bus_gone", "bus_silent"}
@@ -388,12 +406,10 @@ def _taxels(record: Record) -> Iterator[FoundFault]:
             "taxel_pressed", touched, "touched when calibrated; calibrate when nothing touches"
         )
     if unreached := verdicts.get("unreached"):
-        reason = _why_unreached(unreached, verdicts.get("flat", ()))
+        reason = _why_unreached(unreached, verdicts)
         yield fault("taxel_unreached", unreached, f"not valid: no press would be felt: {reason}")
     # If the triangle is already reported as missing, its taxels were absent because of that.
-    kinds = {"stuck": "stuck", "out_of_range": "out of range", "too_noisy": "too noisy"}
-    if not record["triangles"]:
-        kinds |= {"absent": "absent", "too_few": "received too rarely"}
+    kinds = _REFUSED if record["triangles"] else _REFUSED | _NOT_RECEIVED
     invalid = set(record["invalid"])
     why = {kind: invalid & set(verdicts.get(kind, ())) for kind in kinds}
     refused = set().union(*why.values())
@@ -419,19 +435,20 @@ def _taxels(record: Record) -> Iterator[FoundFault]:
         )
 
 
-def _why_unreached(unreached: Collection[int], flat: Collection[int]) -> str:
-    """Why no reading of taxels would be a touch: of some, or all, because their curve is flat."""
-    high = (
+def _why_unreached(unreached: Collection[int], verdicts: Mapping[str, Collection[int]]) -> str:
+    """Why no reading of taxels would be a touch: the reasons of most, and of which others hold."""
+    flat = set(verdicts.get("flat", ()))
+    pressed = {*verdicts.get("touched", ()), *verdicts.get("saturates", ())} - flat
+    reasons = {
         "the threshold is above all their readings; lower margin_units and "
-        "minimum_threshold_units: skin command thresholds"
-    )
-    curve = (
+        "minimum_threshold_units: skin command thresholds": set(unreached) - flat - pressed,
+        "they rest so near 0, pressed as they were calibrated; set the boards up again, then "
+        "calibrate, when nothing touches": pressed.intersection(unreached),
         "the curve does not rise with each unit, by their gain and bend of the calibration and by "
-        "processing.pressure; correct that, or fit them again: skin calibrate --pressure"
-    )
-    if not flat:
-        return high
-    return curve if len(flat) == len(unreached) else f"{high}; of {named(flat)} {curve}"
+        "processing.pressure; correct that, or fit them again: skin calibrate --pressure": flat,
+    }
+    (first, _), *others = ((why, taxels) for why, taxels in reasons.items() if taxels)
+    return "; ".join([first, *(f"of {named(taxels)} {why}" for why, taxels in others)])
 
 
 def _part(record: Record) -> Iterator[FoundFault]:

@@ -312,6 +312,28 @@ def test_a_chip_at_the_address_of_another_is_suspected_where_both_read_wrong(
     assert "does it have this address" not in sentence({1: "not connected", 5: "out of range"})
 
 
+@pytest.mark.parametrize(
+    ("explained", "named_alone"),
+    [
+        ({}, "taxels 5-8"),
+        ({"taxel_faults": {"noisy": [5, 6]}}, "taxels 7-8"),
+        ({"taxel_faults": {"returned": [5, 6, 7, 8]}}, None),
+        ({"taxel_verdicts": {"too_noisy": [8]}}, "taxels 5-7"),
+        ({"taxel_verdicts": {"noisy": [8]}}, "taxels 5-8"),
+        ({"taxel_verdicts": {"unreached": [5], "absent": [6, 7, 8]}}, None),
+    ],
+)
+def test_pads_that_are_not_valid_for_no_reason_of_their_own_are_named_beside_those_with_one(
+    calibrated: FaultBench, explained: dict[str, Any], named_alone: str | None
+) -> None:
+    changes = {"state": "degraded", "invalid": [5, 6, 7, 8], "decides_kpa": 2.0} | explained
+    fault = found(calibrated, **changes).get("taxel_unproven")
+    assert (None if fault is None else fault.sentence.partition(" of ")[0]) == named_alone
+    board = calibrated.records["left_hand"]["boards"][0]["name"]
+    changes["triangles"] = [{"board": board, "triangle": 0, "fault": "no ack"}]
+    assert "taxel_unproven" not in found(calibrated, **changes)
+
+
 def test_taxels_are_named_in_runs_and_no_more_than_eight_of_them() -> None:
     assert named([3]) == "taxel 3"
     assert named([9, 4, 5, 1, 6, 7]) == "taxels 1, 4-7, 9"

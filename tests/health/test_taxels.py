@@ -1,5 +1,7 @@
 """Zeros of taxels that go astray over minutes are told, with what to do about them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from skin_host.bus.compensation import thermal_gains
 from skin_host.health.describe import Describer
 from skin_host.health.diagnosis import diagnose
 from skin_host.layout import PadKind
-from skin_host.processing.calibration import with_gains
+from skin_host.processing.calibration import Verdict, with_gains
 from tests.support.fault_bench import CONFIG, FaultBench
 
 
@@ -107,6 +109,27 @@ def _after(bench: FaultBench, t_s: float) -> FaultBench:
     """The same, at this time."""
     bench.run(t_s - bench.t_s)
     return bench
+
+
+def test_taxels_that_rest_at_the_end_of_the_scale_as_they_were_pressed_are_to_be_set_up_again(
+    bench: FaultBench,
+) -> None:
+    """A lower threshold, which mends others, would not let them feel anything."""
+    calibration = bench.engine.calibration
+    assert calibration is not None
+    part = bench.layout.part("left_hand")
+    baseline, verdict = calibration.baseline.copy(), calibration.verdict.copy()
+    percentile = calibration.percentile.copy()
+    baseline[part.start + 3] = percentile[part.start + 3] = 239.0
+    verdict[part.start + 3] = Verdict.TOUCHED
+    pressed = replace(calibration, baseline=baseline, percentile=percentile, verdict=verdict)
+    bench.engine.use(pressed)
+    bench.run(0.5)
+    record = bench.records["left_hand"]
+    assert record["taxel_verdicts"]["unreached"] == [3]
+    (sentence,) = (line for line in record["sentences"] if "no press would be felt" in line)
+    assert "set the boards up again" in sentence
+    assert "margin_units" not in sentence
 
 
 def test_taxels_that_no_press_reaches_are_named_with_the_reason_and_what_mends_it(

@@ -44,6 +44,7 @@ LASTING = {
     "taxel_refused",
     "taxel_returned",
     "taxel_saturates",
+    "taxel_unreached",
 }
 #: All others end with their cause, after the time that a board's next set-up may take (8 s until it
 #: is queried, 2 s until it is set up, 2 s for its zero), and the 3 s for which health holds what

@@ -12,6 +12,7 @@ TAXELS = {
     "taxel_returned",
     "taxel_saturates",
     "taxel_unproven",
+    "taxel_unreached",
 }
 TRIANGLES = {
     "triangle_answers_again",
@@ -38,7 +39,7 @@ TIMING = {"board_jitter", "board_period", "bus_loses_frames"}
 CHIPS = TAXELS | TRIANGLES
 #: Verdicts of a calibration that was taken meanwhile.
 CALIBRATED = {"taxel_refused", "taxel_saturates", "taxel_drifting", "taxel_at_limit"}
-CALIBRATED |= {"taxel_returned"}
+CALIBRATED |= {"taxel_returned", "taxel_unreached"}
 DAMAGED = {"bus_bit_errors", "bus_stranger", "bus_babbling"}
 DAMAGED |= {"fingertip_saturated", "fingertip_held", "fingertip_noisy", "fingertip_unreached"}
 #: A force/torque board that is not received, or not asked yet for its full scales.
