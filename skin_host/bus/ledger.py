@@ -23,6 +23,7 @@ from skin_host.bus.wire import (
     TAXELS,
     TRIANGLE_BITS,
     TRIANGLES,
+    StatusError,
     out_of_range,
     status_error,
     triangles_in,
@@ -47,6 +48,11 @@ MISSING_SWEEPS = 5
 MTB3_PERIODS = 6.0
 #: So many of its sweeps are missed then.
 ZEROING_SWEEPS = 3
+#: A chip that is lost reads 0xFFFF on all pads. Sent without status words, as in recordings of
+#: other programs, that is 0, beyond all pressures, on this many pads at least, and 255, far below
+#: none, where the correction of temperature wraps. No press does that: on seven triangles of real
+#: skin that were lost it was nine and one.
+LOST_PADS = 8
 #: A period that differs by more than this share is not the one that was set.
 WRONG_PERIOD = 0.25
 #: For a regular board all intervals, except the longest and shortest fifth, lie within this share.
@@ -138,9 +144,10 @@ class BoardLedger:
         last: the last sweep of each board.
         sweeps: int64[b], how many were received.
         present: bool[b, 16], triangles of the last sweep.
-        error: uint8[b, 16], error nibbles of the last sweep's status words, see `StatusError`.
-        far: bool[b, 16, 12], pads that the last sweep's status words mark as far out of range.
-        flagged: whether a board's last sweep had any status word that is not 0.
+        error: uint8[b, 16], error nibbles of the last sweep's status words, see `StatusError`; also
+            of a chip whose bytes show that it is lost.
+        far: bool[b, 16, 12], pads that are marked so as far out of range.
+        flagged: whether a board's last sweep had any of these.
         absent: int64[b, 16], in how many sweeps in a row each enabled triangle has been missing.
         twice: rows of boards at whose address a second one sends, each with the time of a sweep
             since when: what comes is of one or the other.
@@ -182,6 +189,8 @@ class BoardLedger:
         self.error = np.zeros((n, TRIANGLES), np.uint8)
         self.far = np.zeros((n, TRIANGLES, TAXELS), np.bool_)
         self.flagged = [False] * n
+        #: Of boards with chips that are lost by their bytes, which triangles bool[16] these are.
+        self._lost: dict[int, Mask] = {}
         self.absent = np.zeros((n, TRIANGLES), np.int64)
         self._complete = [True] * n
         self._intervals_ns = [[0] * INTERVALS for _ in range(n)]
@@ -251,11 +260,38 @@ class BoardLedger:
             self.absent[row] = (self.absent[row] + enabled) * ~self.present[row]
         # Comparing bytes costs a tenth of numpy's `any`.
         flagged = sweep.status is not NO_STATUS and sweep.status.tobytes() != _NO_STATUS
-        if flagged or self.flagged[row]:
-            self.flagged[row] = flagged
+        lost = self._note_lost(row, sweep, before)
+        if flagged or lost is not None or self.flagged[row]:
+            self.flagged[row] = flagged or lost is not None
             self.error[row] = status_error(sweep.status)
             self.far[row] = out_of_range(sweep.status)
+            if lost is not None:
+                self.error[row, lost] |= np.uint8(StatusError.NOT_CONNECTED)
+                self.far[row, lost] = True
         return row
+
+    def _note_lost(self, row: int, sweep: Sweep, before: Sweep | None) -> Mask | None:
+        """Return the triangles bool[16] whose chips are lost by their bytes; None if none is. Their
+        status word has precedence.
+
+        A pad that read 255 already, before all others read 0, is one that is out of range beside a
+        press.
+        """
+        lost_before = self._lost.pop(row, None)
+        missing = TRIANGLES - sweep.present.bit_count()
+        if sweep.raw.tobytes().count(0) < LOST_PADS + TAXELS * missing:
+            return None
+        wrapped = sweep.raw == 255
+        if before is not None:
+            was_far = before.raw == 255
+            wrapped &= ~was_far if lost_before is None else ~was_far | lost_before[:, None]
+        pressed = np.count_nonzero(sweep.raw == 0, axis=1)
+        lost: Mask = self.present[row] & (pressed >= LOST_PADS) & wrapped.any(axis=1)
+        lost &= sweep.status == 0
+        if not lost.any():
+            return None
+        self._lost[row] = lost
+        return lost
 
     def set_up(self, row: int) -> None:
         """Note that a board has been set up: its earlier sweeps are no longer compared with the

@@ -32,6 +32,9 @@ THERMAL_UNITS = 8.0
 #: Limit of the median shift of all untouched taxels from their baselines, in units as the part's
 #: coarsest triangle sends them; used without temperature pads. Less is noise, or rounding.
 COMMON_UNITS = 1.5
+#: What falls by so much at once, in the same units (20 degrees), is no temperature: something that
+#: pressed the whole part when it was zeroed has been lifted. Its zeros follow within seconds.
+LIFTED_UNITS = 10.0
 #: Kinds of interface that no real board is on; the kernel's are named vcan.
 EMULATED = {"virtual", "socketpair"}
 #: Number of chips that share one data line.
@@ -465,13 +468,14 @@ def _part(record: Record) -> Iterator[FoundFault]:
         return
     thermal_units, common_units = warmth["thermal_units"], warmth["common_units"]
     least_units = COMMON_UNITS * warmth["coarsest_units"]
+    lifted_units = LIFTED_UNITS * warmth["coarsest_units"]
     if thermal_units is not None and abs(thermal_units) > max(THERMAL_UNITS, least_units):
         yield fault(
             "part_temperature",
             f": its thermal pads read {thermal_units:+.0f} units since the "
             "calibration: its temperature has changed; pressures are corrected, less precisely",
         )
-    elif abs(common_units) > least_units:
+    elif abs(common_units) > least_units and common_units > -lifted_units:
         yield fault(
             "part_temperature",
             f": its untouched taxels all read {common_units:+.1f} units off their "

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from skin_host.bus.assembler import Assembler, Sweep
 from skin_host.bus.ledger import (
@@ -18,7 +19,7 @@ from skin_host.bus.ledger import (
     TWICE_NS,
     BoardLedger,
 )
-from skin_host.bus.wire import FrameBatch, encode_sweep, triangles_in
+from skin_host.bus.wire import FrameBatch, StatusError, encode_sweep, triangles_in
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings, load
 from skin_host.layout import BoardLayout, build_layout
 from tests.support.stack import ROOT
@@ -54,6 +55,76 @@ def sweep(
     mask = enabled(board) if present is None else present
     words = np.full(16, status, np.uint16)
     return Sweep(board, np.zeros((16, 12), np.uint8), words, mask, t_ns, 0, crowded)
+
+
+LOST = [0, 0, 0, 0, 0, 0, 240, 0, 0, 255, 240, 0]
+PRESSED = [0, 0, 0, 0, 0, 0, 240, 0, 0, 0, 240, 0]
+
+
+def sends(
+    known: BoardLedger,
+    number: int,
+    *triangle: list[int],
+    present: int | None = None,
+    status: NDArray[np.uint16] | None = None,
+) -> int:
+    """A sweep, without status words or with these, whose first triangles read this and whose others
+    rest.
+    """
+    one = sweep(HAND, T0 + number * PERIOD, present)
+    raw = np.zeros((16, 12), np.uint8)
+    raw[triangles_in(one.present)] = 240
+    for index, pads in enumerate(triangle):
+        raw[index] = pads
+    return known.note(one._replace(raw=raw, status=one.status if status is None else status))
+
+
+def test_a_chip_that_is_lost_shows_without_status_words() -> None:
+    """As on recordings of real skin: its pads read beyond all pressures, and one of them below."""
+    known = ledger()
+    sends(known, 0)
+    for number in range(1, 4):
+        row = sends(known, number, LOST)
+        assert np.flatnonzero(known.error[row] == StatusError.NOT_CONNECTED).tolist() == [0]
+        assert known.far[row, 0].all() and not known.far[row, 1:].any()
+        assert known.flagged[row]
+        assert not known.answered(row)[0]
+    row = sends(known, 4)
+    assert known.answered(row)[0] and not known.flagged[row]
+
+
+def test_a_chip_that_is_lost_from_the_first_is_found_at_once() -> None:
+    known = ledger()
+    assert not known.answered(sends(known, 0, LOST))[0]
+
+
+@pytest.mark.parametrize("first", [[240] * 9 + [255] + [240] * 2, [180] * 9 + [255] + [240] * 2])
+def test_a_hard_press_beside_a_pad_that_is_out_of_range_is_no_lost_chip(first: list[int]) -> None:
+    known = ledger()
+    sends(known, 0, first)
+    for number in range(1, 4):
+        assert not known.flagged[sends(known, number, LOST)]
+
+
+def test_what_a_board_marks_is_not_judged_by_its_bytes() -> None:
+    known = ledger()
+    sends(known, 0)
+    marked = np.full(16, 1 << 4, np.uint16)
+    row = sends(known, 1, LOST, status=marked)
+    assert not known.error[row].any()
+
+
+def test_a_press_beyond_the_scale_is_no_lost_chip() -> None:
+    known = ledger()
+    sends(known, 0)
+    assert not known.flagged[sends(known, 1, PRESSED, PRESSED)]
+
+
+def test_triangles_that_are_missing_are_no_lost_chips() -> None:
+    known = ledger()
+    sends(known, 0)
+    row = sends(known, 1, present=0b10)
+    assert not known.flagged[row]
 
 
 def after(intervals_ms: list[float]) -> BoardLedger:

@@ -68,7 +68,7 @@ def here(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(folder)
     monkeypatch.setenv("XDG_STATE_HOME", str(folder))
     monkeypatch.setattr("skin_host.cli.watch.run", partial(run, duration_s=WHILE_S))
-    monkeypatch.setattr("skin_host.cli.operate.set_up_logging", lambda _: None)
+    monkeypatch.setattr("skin_host.cli.operate.set_up_logging", lambda *_: None)
     matplotlib.use("agg")
     return folder
 

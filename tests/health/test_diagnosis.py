@@ -210,6 +210,9 @@ def test_a_board_may_be_off_by_a_twentieth_of_its_period_and_scatter_a_little_mo
         (None, 1.6, 1.0, "all read +1.6"),
         (None, -1.6, 1.0, "all read -1.6"),
         (0.0, 2.0, 1.0, "all read +2.0"),
+        (None, -9.9, 1.0, "all read -9.9"),
+        # What pressed all of it when it was zeroed has been lifted.
+        (None, -14.9, 1.0, None),
         # Less than 1.5 units as they were sent is noise.
         (8.1, 3.0, 2.0, "thermal pads read +8"),
         (8.0, 3.0, 2.0, None),
