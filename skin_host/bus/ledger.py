@@ -50,8 +50,8 @@ MTB3_PERIODS = 6.0
 ZEROING_SWEEPS = 3
 #: A chip that is lost reads 0xFFFF on all pads. Sent without status words, as in recordings of
 #: other programs, that is 0, beyond all pressures, on this many pads at least, and 255, far below
-#: none, where the correction of temperature wraps. No press does that: on seven triangles of real
-#: skin that were lost it was nine and one.
+#: none, where the correction of temperature wraps. No press does that: on 15 triangles of real skin
+#: that were lost it was nine and one.
 LOST_PADS = 8
 #: A period that differs by more than this share is not the one that was set.
 WRONG_PERIOD = 0.25
