@@ -284,7 +284,9 @@ class BoardLedger:
         wrapped = sweep.raw == 255
         if before is not None:
             was_far = before.raw == 255
-            wrapped &= ~was_far if lost_before is None else ~was_far | lost_before[:, None]
+            if lost_before is not None:
+                was_far[lost_before] = False
+            wrapped &= ~was_far
         pressed = np.count_nonzero(sweep.raw == 0, axis=1)
         lost: Mask = self.present[row] & (pressed >= LOST_PADS) & wrapped.any(axis=1)
         lost &= sweep.status == 0
@@ -390,9 +392,7 @@ class BoardLedger:
         return np.array([*intervals[oldest:], *intervals[:oldest]][:n], np.int64)
 
     def answered(self, row: int) -> NDArray[np.bool_]:
-        """Return the triangles bool[16] of a board whose last sweep came without an error in its
-        status word.
-        """
+        """Return the triangles bool[16] of a board whose last sweep came without an `error`."""
         found: NDArray[np.bool_] = self.present[row] & (self.error[row] == 0)
         return found
 

@@ -47,7 +47,7 @@ def _touch_line(touch: Touch) -> str:
     if touch.event == "end":
         load = " " * len(load)
     felt = f"  taxels {taxels}" if taxels else ""
-    why = "" if touch.reason in (None, "released") else f"  {touch.reason}: it may still last"
+    why = f"  {touch.reason}: it may still last" if touch.may_last else ""
     return _line(touch.part, touch.event, touch.id, f"{where} {load}{felt}{why}")
 
 

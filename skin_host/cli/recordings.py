@@ -307,10 +307,9 @@ async def _capture(
         sink = log.put if log is not None else recorder.can
         told["frames_lost"] = await capture_buses(settings, sink, stop)
 
-    async def for_the_time() -> None:
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), arguments.seconds)
-        stop.set()
+    async def begin_the_time() -> None:
+        if arguments.seconds is not None:
+            asyncio.get_running_loop().call_later(arguments.seconds, stop.set)
 
     if recorder is not None and (arguments.broker is not None or settings is None):
         url = arguments.broker or LOCAL
@@ -328,7 +327,7 @@ async def _capture(
     async with contextlib.AsyncExitStack() as stack:
         stack.callback(stop.set)  # one that fails ends the other
         # Buses are opened in the first step of theirs, which may take seconds; the time follows.
-        await asyncio.gather(*sources, for_the_time())
+        await asyncio.gather(*sources, begin_the_time())
     return told
 
 

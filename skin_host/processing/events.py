@@ -102,6 +102,11 @@ class Touch(
             return self.load.verdict == "saturated"
         return self.partial or self.beyond
 
+    @property
+    def may_last(self) -> bool:
+        """Whether it is an end without a release."""
+        return self.reason in ("lost", "stopped")
+
     def ended(self, seq: int, t_ns: int, reason: Reason = "released") -> "Touch":
         """The contact's end: where it was last; what is known of its pressures is 0."""
         nothing_kpa = None if self.area_mm2 is None else 0.0

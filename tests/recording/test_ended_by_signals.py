@@ -4,16 +4,14 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
-import can
 import pytest
 
 from tests.support.candump import write_config, write_log
+from tests.support.talking import live, talking
 from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -31,17 +29,6 @@ def begin(*arguments: str, hangups: str = "default") -> "subprocess.Popen[str]":
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
-
-
-def live(folder: Path) -> Path:
-    """Write a configuration of a bus of this machine."""
-    path = write_config(folder / "skin.toml")
-    path.write_text(
-        path.read_text().replace(
-            'channel = "can0"', f'channel = "{GROUP}"\ninterface = "udp_multicast"'
-        )
-    )
-    return path
 
 
 def wait_until(is_so: Callable[[], bool]) -> None:
@@ -74,25 +61,6 @@ def test_a_replay_that_is_ended_leaves_no_file(
     assert not any(out.iterdir())
 
 
-@contextmanager
-def talking() -> Iterator[None]:
-    """A board sends on the bus of `live`."""
-    ended = threading.Event()
-
-    def send() -> None:
-        with can.Bus(interface="udp_multicast", channel=GROUP) as bus:
-            while not ended.wait(0.01):
-                bus.send(can.Message(arbitration_id=0x4E4, data=b"@", is_extended_id=False))
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        sender.join()
-
-
 def is_recorded(folder: Path) -> bool:
     """Whether frames have come to a recording that has no name yet."""
     return any(path.stat().st_size for path in folder.iterdir() if path.suffix != ".toml")
@@ -101,9 +69,9 @@ def is_recorded(folder: Path) -> bool:
 @pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 def test_a_recording_that_is_ended_gets_its_name(tmp_path: Path, number: signal.Signals) -> None:
     """A terminal that is closed sends SIGHUP."""
-    config = live(tmp_path)
+    config = live(tmp_path, GROUP)
     path = tmp_path / "a.log"
-    with talking(), begin("record", str(path), "--config", str(config)) as running:
+    with talking(GROUP), begin("record", str(path), "--config", str(config)) as running:
         wait_until(lambda: is_recorded(tmp_path))
         running.send_signal(number)
         said, err = running.communicate(timeout=PATIENCE_S)
@@ -114,10 +82,10 @@ def test_a_recording_that_is_ended_gets_its_name(tmp_path: Path, number: signal.
 
 
 def test_a_recording_under_nohup_goes_on_when_its_terminal_is_closed(tmp_path: Path) -> None:
-    config = live(tmp_path)
+    config = live(tmp_path, GROUP)
     path = tmp_path / "a.log"
     command = ["record", str(path), "--config", str(config)]
-    with talking(), begin(*command, hangups="ignore") as running:
+    with talking(GROUP), begin(*command, hangups="ignore") as running:
         wait_until(lambda: is_recorded(tmp_path))
         running.send_signal(signal.SIGHUP)
         with pytest.raises(subprocess.TimeoutExpired):

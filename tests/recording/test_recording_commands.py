@@ -6,13 +6,11 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import can
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -32,6 +30,7 @@ from skin_host.recording.export import read_messages
 from skin_host.recording.mcap import Recorder, read_messages_of, recorded_topics
 from tests.support.broker import Mosquitto
 from tests.support.candump import write_config, write_log
+from tests.support.talking import live, talking
 from tests.support.waiting import PATIENCE_S, until
 from tests.support.world import World
 
@@ -250,24 +249,9 @@ def test_the_time_of_a_recording_begins_when_its_buses_are_open(
 
     monkeypatch.setattr(capture, "open_port", slowly)
     group = "239.74.163.50"
-    config = write_config(tmp_path / "skin.toml")
-    live = f'channel = "{group}"\ninterface = "udp_multicast"'
-    config.write_text(config.read_text().replace('channel = "can0"', live))
-    ended = threading.Event()
-
-    def send() -> None:
-        with can.Bus(interface="udp_multicast", channel=group) as bus:
-            while not ended.wait(0.01):
-                bus.send(can.Message(arbitration_id=0x4E4, data=b"@", is_extended_id=False))
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    words = ["record", str(tmp_path / "a.log"), "--config", str(config), "--json"]
-    try:
+    words = ["record", str(tmp_path / "a.log"), "--config", str(live(tmp_path, group)), "--json"]
+    with talking(group):
         assert main([*words, "--seconds", "0.4"]) == 0
-    finally:
-        ended.set()
-        sender.join()
     assert json.loads(capsys.readouterr().out)["frames"] > 3
 
 

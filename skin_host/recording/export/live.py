@@ -119,7 +119,7 @@ class _View:
     def show_touch(self, touch: Touch) -> None:
         if touch.part in self.scene.origins_m:
             self._note_time(touch)
-            if touch.reason in ("lost", "stopped"):
+            if touch.may_last:
                 self._doubtful.add(touch.part)
             arrows = self.scene.arrows(touch.part, touch.t_ns, [touch])
             is_known = arrows.is_known and touch.part not in self._doubtful

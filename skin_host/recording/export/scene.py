@@ -275,7 +275,7 @@ def event_line(event: FingertipEvent) -> EventLine | None:
     """Return an event as a line; None for one that arrows show."""
     who = f"{event.part}: contact {event.id}"
     match event:
-        case Touch(event="end", reason="lost" | "stopped"):
+        case Touch() if event.may_last:
             text = f"{who} ended without a release ({event.reason}): it may still last"
         case Touch():
             return None

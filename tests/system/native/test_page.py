@@ -96,6 +96,8 @@ PARTS = """(() => {
               outline_m: [[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]] },
         ], ...more,
     });
+    const connect = () => say(
+        "status", { connected: true, commands: true, error: "", nodes: { main: true } });
     let seq = 0;
     const frameOf = (version, number, age_s, bits, ...raw) => {
         const view = new DataView(new ArrayBuffer(41 + raw.length));
@@ -596,7 +598,7 @@ RAW_SERVER = (
     + """
     say("layout", { version: 10, robot: "r", parts: [part("palm"), part("wrist")],
                     nodes: { main: { commands: true } } });
-    say("status", { connected: true, commands: true, error: "", nodes: { main: true } });
+    connect();
     window.bytes = (number, byte, bits) => serve(frameOf(10, number, 0, bits, byte));
     return true;
 })()"""
@@ -670,7 +672,7 @@ THINNED = (
     window.layOut = (version, parts) => say("layout", { version, robot: "r", nodes: {}, parts });
     window.palm = [part("palm", two)];
     window.wrist = [part("wrist", { thinned: true })];
-    say("status", { connected: true, commands: true, error: "", nodes: { main: true } });
+    connect();
     return true;
 })()"""
 )
