@@ -151,11 +151,13 @@ async def _report_absence(skin: "SkinClient") -> None:
     while True:
         why = _absence(skin)
         if why != said:
-            if why:
-                warn(f"{why}; waiting")
-            else:
-                print("events can come now", file=sys.stderr)
             said = why
+            if not why:
+                print("events can come now", file=sys.stderr)
+            elif skin.connected and not skin.nodes:
+                warn(f"{await skin.absence('is online')}; waiting")
+            else:
+                warn(f"{why}; waiting")
         await asyncio.sleep(1.0)
 
 

@@ -295,7 +295,7 @@ class SkinClient:
         known = {name: node.info for name, node in self.nodes.items() if node.info is not None}
         if not known:
             self._refuse_unread(lambda subscriptions: set(subscriptions.nodes))
-            why = self.info_error or await self._nobody("published its info")
+            why = self.info_error or await self.absence("published its info")
             raise BrokerError(f"broker {self.where}: {why}")
         return known
 
@@ -341,10 +341,11 @@ class SkinClient:
             except TimeoutError:
                 if not self.connected:
                     raise CommandError(f"broker {self.where}: {self.last_error}") from None
+                running = "is `skin run` running there?"
                 raise CommandError(
                     f'no answer to "{name}" from node "{node or "?"}" of robot "{self.robot}" '
                     f"within {timeout_s:g} s; it may still be carried out; "
-                    "is `skin run` running there?"
+                    f"{running if self.nodes else await self.absence('is known')}"
                 ) from None
             except MqttError as error:
                 raise CommandError(f"broker {self.where}: {explain(error)}") from None
@@ -428,6 +429,18 @@ class SkinClient:
     async def __aexit__(self, *_: object) -> None:
         refuse_other_loop(self._loop)
         await self._stop()
+
+    async def absence(self, what: str) -> str:
+        """Return as a sentence that no node of the robot does something, such as "is online", and
+        which other robots the broker knows: the name may be misspelt.
+        """
+        start = f'no node of robot "{self.robot}" {what}; '
+        link = self._links[0]
+        others: list[str] = []
+        if link.connection and not self.nodes:
+            others = await robots_at(link.broker, self._base, f"{self._identifier}-robots")
+        names = some_of([visible(name, 64) for name in others])
+        return start + (f"there are the robots: {names}" if names else "is `skin run` running?")
 
     async def _stop(self) -> None:
         self._stopping = True
@@ -527,16 +540,6 @@ class SkinClient:
             )
         return known
 
-    async def _nobody(self, what: str) -> str:
-        """Return that no node of the robot did something, and which other robots there are."""
-        start = f'no node of robot "{self.robot}" {what}; '
-        link = self._links[0]
-        others: list[str] = []
-        if link.connection and not self.nodes:
-            others = await robots_at(link.broker, self._base, f"{self._identifier}-robots")
-        names = some_of([visible(name, 64) for name in others])
-        return start + (f"there are the robots: {names}" if names else "is `skin run` running?")
-
     async def _only(self, known: list[str]) -> str:
         """Return the node of these that is online.
 
@@ -549,7 +552,7 @@ class SkinClient:
         if len(online) == 1:
             return online[0]
         if not online:
-            raise BrokerError(f"broker {self.where}: {await self._nobody('is online')}")
+            raise BrokerError(f"broker {self.where}: {await self.absence('is online')}")
         raise RequestError(
             f'robot "{self.robot}": wanted one node that is online, there are: '
             f"{', '.join(online)}; name the node"

@@ -130,8 +130,11 @@ async def test_why_no_events_come_is_on_stderr(mosquitto: Mosquitto) -> None:
     gone = f"127.0.0.1:{free_port()}"
     missing = await first_warning("--broker", f"mqtt://{gone}")
     assert missing.startswith(f"warning: no broker at {gone}: Connection refused")
-    nobody = 'warning: no node of robot "fingertips" is online: is `skin run` running?; waiting\n'
-    assert await first_warning(*where) == nobody
+    nobody = 'warning: no node of robot "fingertips" is online; '
+    assert await first_warning(*where) == f"{nobody}is `skin run` running?; waiting\n"
+    async with Publisher(Mqtt(host=mosquitto.host, port=mosquitto.port), "demo", "main"):
+        there = f"{nobody}there are the robots: demo; waiting\n"
+        assert await first_warning(*where) == there
 
 
 async def test_a_part_that_the_robot_does_not_have_ends_it(

@@ -484,6 +484,15 @@ async def test_a_command_goes_to_a_node_of_which_the_broker_keeps_nothing(
             await skin.command("calibrate", node="main", timeout_s=1.0)
 
 
+async def test_a_command_to_a_robot_that_is_not_there_names_those_that_are(
+    mosquitto: Mosquitto,
+) -> None:
+    async with publishing(mosquitto), hearing(mosquitto, robot="robt") as skin:
+        there = 'no node of robot "robt" is known; there are the robots: robot'
+        with pytest.raises(CommandError, match=there):
+            await skin.command("calibrate", node="main", timeout_s=1.0)
+
+
 @pytest.mark.parametrize(
     ("name", "cause", "status"),
     [("refuse", "request", 2), ("later", "state", 1), ("fail", "failure", 1)],
@@ -915,7 +924,7 @@ async def test_a_command_that_lasts_is_waited_for_that_long(
         with pytest.raises(CommandError, match="no answer"):
             await skin.command("calibrate", seconds=seconds)
         monkeypatch.undo()
-    assert waited_s == [ANSWER_S + lasts_s]
+    assert waited_s[0] == ANSWER_S + lasts_s
 
 
 async def test_who_cannot_read_frames_gets_an_error_once_and_the_log_each_reason(

@@ -15,9 +15,10 @@ from msgspec.structs import replace
 from skin_host.cli import main
 from skin_host.errors import RequestError, SkinError, required
 from skin_host.mqtt.info import FingertipInfo, PartInfo, TriangleInfo
+from skin_host.mqtt.messages import ContactState
 from skin_host.processing.events import Touch
 from skin_host.recording.export import HealthLine, PartSeries, Series, export
-from skin_host.recording.export.known import Gone
+from skin_host.recording.export.known import ContactLine, Gone
 from skin_host.recording.export.scene import ARROW_M_PER_N, POINT, RecordedScene, SkinScene
 from tests.recording.test_export_tables import BEGIN, LOAD, LOST, OVER, SLIP
 from tests.support.rerun import chunks
@@ -264,6 +265,28 @@ def test_no_force_and_no_pressure_is_0_where_it_is_not_known(
     forces_n = course(reader, "/force_n/arm")
     np.testing.assert_array_equal(forces_n, [1.5, 0.0, 1.5, np.nan, 1.5, np.nan])
     assert np.isnan(course(reader, "/kpa/arm")).tolist() == [False] * N + [True]
+
+
+def test_after_a_lost_contact_the_force_is_not_known_until_the_part_is_untouched(
+    series: Series, tmp_path: Path
+) -> None:
+    """The next one's release does not end the first, which may still press."""
+    from rerun.chunk import RrdReader
+
+    begin, _, end = series.touches
+    touches = [begin, replace(end, t_ns=begin.t_ns + 1, reason="lost")]
+    touches.append(replace(begin, id=8, t_ns=begin.t_ns + 3))
+    touches.append(replace(end, id=8, t_ns=begin.t_ns + 4, reason="released"))
+    touches.append(replace(begin, id=9, t_ns=begin.t_ns + 8))
+    states: list[tuple[int, ContactState]] = [(-2, "OFF"), (0, "ON"), (1, "UNKNOWN")]
+    states += [(3, "ON"), (6, "OFF"), (9, "OFF"), (10, "ON")]
+    contacts = [ContactLine("arm", begin.t_ns + after_ns, state) for after_ns, state in states]
+    contacts.append(ContactLine("hand", begin.t_ns + 2, "OFF"))
+    shown = dataclasses.replace(series, touches=touches, contacts=contacts)
+    export(shown, tmp_path / "a.rrd")
+    reader = RrdReader(tmp_path / "a.rrd")
+    forces_n = [0.0, 1.5, np.nan, np.nan, np.nan, 0.0, 1.5]
+    np.testing.assert_array_equal(course(reader, "/force_n/arm"), forces_n)
 
 
 def test_rerun_reads_the_file_for_foxglove_too(series: Series, tmp_path: Path) -> None:

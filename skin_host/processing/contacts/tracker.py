@@ -1,6 +1,7 @@
 """Follows the contacts of a part from frame to frame, and reports what changes."""
 
 import math
+from collections import Counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,7 +203,7 @@ class ContactTracker:
     ) -> list[frozenset[int]]:
         """Return the groups, with contacts kept apart that have only just grown together.
 
-        New taxels belong to the contact with most taxels; each other contact keeps its own.
+        Each keeps its taxels, and new ones belong to the nearest.
         """
         if self._are_as_before(groups):
             return groups
@@ -214,17 +215,37 @@ class ContactTracker:
                     self._contacts[largest].merged_ns = None
                 kept.append(group)
                 continue
-            rest = group
+            owner: dict[int, int] = {}
             for name in (largest, *others):
                 contact = self._contacts[name]
                 if contact.merged_ns is None:
                     contact.merged_ns = elapsed_ns
-                if name != largest and elapsed_ns - contact.merged_ns < MERGED_NS:
-                    own = group & contact.taxels
-                    rest -= own
-                    kept.append(own)
-            kept.append(rest)
+                is_apart = name != largest and elapsed_ns - contact.merged_ns < MERGED_NS
+                owner.update(dict.fromkeys(group & contact.taxels, name if is_apart else largest))
+            self._spread(owner, group)
+            shares: dict[int, list[int]] = {}
+            for taxel in group:
+                shares.setdefault(owner.get(taxel, largest), []).append(taxel)
+            kept += map(frozenset, shares.values())
         return sorted(kept, key=min) if len(kept) > 1 else kept
+
+    def _spread(self, owner: dict[int, int], group: frozenset[int]) -> None:
+        """Give each taxel of a group that has no owner, and is connected with one that has, the
+        nearest one: where there are several, that of most of its neighbours.
+
+        Args:
+            owner: of taxels; those of contacts with more taxels come first.
+            group: the taxels.
+        """
+        reached = list(owner)
+        while reached:
+            ring: dict[int, Counter[int]] = {}
+            for taxel in reached:
+                for other in self._neighbours[taxel]:
+                    if other in group and other not in owner:
+                        ring.setdefault(other, Counter())[owner[taxel]] += 1
+            owner |= {taxel: found.most_common(1)[0][0] for taxel, found in ring.items()}
+            reached = list(ring)
 
     def _kept_whole(
         self,

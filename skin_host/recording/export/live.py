@@ -89,8 +89,6 @@ class _View:
         self._infos: dict[str, PartInfo | FingertipInfo] | None = None
         #: By part: the time in its last message that has one, and when that came by our clock.
         self._last: dict[str, tuple[int, int]] = {}
-        #: Parts of which a contact ended that may still last: their force is not known.
-        self._doubtful: set[str] = set()
         self.shapes: dict[str, PartInfo] = {}
 
     def lay_out(self, parts: Mapping[str, Described], touches: Iterable[Touch]) -> None:
@@ -119,14 +117,9 @@ class _View:
     def show_touch(self, touch: Touch) -> None:
         if touch.part in self.scene.origins_m:
             self._note_time(touch)
-            if touch.may_last:
-                self._doubtful.add(touch.part)
-            arrows = self.scene.arrows(touch.part, touch.t_ns, [touch])
-            is_known = arrows.is_known and touch.part not in self._doubtful
-            self.show(arrows._replace(is_known=is_known))
+            self.show(self.scene.arrows(touch.part, touch.t_ns, [touch]))
 
     def show_untouched(self, part: str) -> None:
-        self._doubtful.discard(part)
         now_ns = self._now_ns(part)
         if now_ns is not None and part in self.scene.origins_m:
             self.show(self.scene.untouched(part, now_ns))

@@ -12,6 +12,7 @@ its frame.
 from collections.abc import Iterable, Iterator, Mapping
 from heapq import merge
 from itertools import groupby
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -129,6 +130,8 @@ class SkinScene:
         self._points: dict[str, NDArray[np.void]] = {}
         self.origins_m = _side_by_side(shapes, fingertips or {})
         self._arrows: dict[str, dict[int, Arrow]] = {name: {} for name in self.origins_m}
+        #: Parts of which a contact ended that may still last: their force is not known.
+        self._doubtful: set[str] = set()
         self.radius_m = {
             name: float(np.mean(shape.radius_mm or [0.0])) * 1e-3 for name, shape in shapes.items()
         }
@@ -180,15 +183,24 @@ class SkinScene:
             arrow = _arrow(touch)
             if arrow is not None:
                 there[touch.id] = arrow
+            if touch.may_last:
+                self._doubtful.add(part)
             reason = touch.reason
-        return Arrows(part, t_ns, list(there.values()), bool(there) or reason == "released")
+        is_known = part not in self._doubtful and (bool(there) or reason == "released")
+        return Arrows(part, t_ns, list(there.values()), is_known)
 
     def untouched(self, part: str, t_ns: int, *, is_known: bool = True) -> Arrows:
         """Nothing touches a part, or nothing is known of that, whatever has been received of its
         contacts.
         """
         self._arrows[part].clear()
+        if is_known:
+            self.end_doubt(part)
         return Arrows(part, t_ns, [], is_known)
+
+    def end_doubt(self, part: str) -> None:
+        """Take the contacts of a part that ended without a release for ended from here on."""
+        self._doubtful.discard(part)
 
 
 class RecordedScene:
@@ -251,13 +263,26 @@ class RecordedScene:
 
     def _arrows(self, name: str) -> Iterator[Item]:
         mine = (touch for touch in self._series.touches if touch.part == name)
-        gone_ns = self._series.gone_ns(name)
-        for t_ns, touches in groupby(mine, key=lambda touch: touch.t_ns):
-            while gone_ns and gone_ns[0] <= t_ns:
-                yield self.scene.untouched(name, gone_ns.pop(0), is_known=False)
-            yield self.scene.arrows(name, t_ns, touches)
-        for last_ns in gone_ns:
-            yield self.scene.untouched(name, last_ns, is_known=False)
+        by_time = groupby(mine, key=attrgetter("t_ns"))
+        gone: Iterator[tuple[int, list[Touch] | bool]]
+        gone = ((t_ns, False) for t_ns in self._series.gone_ns(name))
+        states = [line for line in self._series.contacts if line.part == name]
+        untouched = ((line.t_ns, True) for line in states if line.state == "OFF")
+        touched = ((t_ns, list(touches)) for t_ns, touches in by_time)
+        shown: Arrows | None = None
+        for t_ns, what in merge(gone, touched, untouched, key=itemgetter(0)):
+            if isinstance(what, list):
+                shown = self.scene.arrows(name, t_ns, what)
+                if not states:
+                    self.scene.end_doubt(name)  # or no event of the recording would
+            elif not what:
+                shown = self.scene.untouched(name, t_ns, is_known=False)
+            elif shown is None or not (shown.is_known or shown.arrows):
+                # States have the recorder's time: one may come after the touch that follows it.
+                shown = self.scene.untouched(name, t_ns)
+            else:
+                continue
+            yield shown
 
 
 def _arrow(touch: Touch) -> Arrow | None:
