@@ -306,8 +306,8 @@ class Cable:
         state: of the interface, as the port is to find it.
         damaged_ns: when a frame was last damaged.
         blurred_ns: when frames last came late or in another order while a second board sent at
-            their address, or a board's sweeps passed close together: what belongs to which cannot
-            be known then.
+            their address, or a board's sweeps passed close together, or were lost while a second
+            board sent: what belongs to which cannot be known then.
         fate: what became of the frames since the port was opened.
         sent: what passed over the bus.
     """
@@ -387,9 +387,11 @@ class Cable:
             return
         if n:
             self.sent.note(batch)
-        if self.mischief.late or self.mischief.swapped or self._late:
+        what = self.mischief
+        is_late = what.late or what.swapped or self._late
+        if is_late or (what.lost and what.twin is not None):
             now_ns = self._clock.monotonic_ns()
-            if self.mischief.twin is not None or now_ns - self.sent.crowded_ns < CROWDED_NS:
+            if what.twin is not None or now_ns - self.sent.crowded_ns < CROWDED_NS:
                 self.blurred_ns = now_ns
         if n and self.mischief.any():
             batch = self._spoil(batch)
