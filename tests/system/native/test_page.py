@@ -702,14 +702,20 @@ async def test_what_is_at_the_cursor_stands_beside_it_under_a_banner(
             : document.getElementById("tip").getBoundingClientRect().top
                 - document.getElementById("map").getBoundingClientRect().top
                 - window.labels.find(([text]) => text.startsWith("palm"))[2]"""
+
+        async def drawn() -> None:
+            """A slow browser draws the map some more times before all have their places."""
+            draws = await seen.run("Number(document.body.dataset.draws)")
+            await seen.until(f"Number(document.body.dataset.draws) > {draws} + 2")
+
+        await seen.until(f"{below} !== null")
+        await drawn()
         before = await seen.until(below)
         # The connection is lost: the banner stands above the map.
         await seen.run("lose()")
         high = await seen.until('document.getElementById("banner").offsetHeight')
         assert high > 30
-        # A slow browser draws the map some more times before that has its new place.
-        draws = await seen.run("Number(document.body.dataset.draws)")
-        await seen.until(f"Number(document.body.dataset.draws) > {draws} + 2")
+        await drawn()
         await seen.until(f"Math.abs({below} - {before}) < {high / 2}")
 
 
