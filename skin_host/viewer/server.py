@@ -231,13 +231,21 @@ class Viewer:
         if path == "/live":
             if origin not in (f"http://{host}", f"https://{host}"):
                 return _response(HTTPStatus.FORBIDDEN, "text/plain", b"not from our own page\n")
-            if self._pages >= MAX_PAGES:
-                return _response(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"too many pages\n")
-            return None
+            return self._refuse_more()
+        # A browser does not show why a WebSocket is refused.
+        if path == "/" and (refusal := self._refuse_more()) is not None:
+            return refusal
         file = self._files.get("index.html" if path == "/" else path.removeprefix("/"))
         if file is None:
             return _response(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
         return _response(HTTPStatus.OK, *file)
+
+    def _refuse_more(self) -> Response | None:
+        """Return the refusal of a page, or its WebSocket, while as many are open as may be."""
+        if self._pages < MAX_PAGES:
+            return None
+        text = f"{MAX_PAGES} pages are open already; close one, and load this one again\n"
+        return _response(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", text.encode())
 
     async def _talk(self, page: ServerConnection) -> None:
         """Send one page its new messages until it closes, and take its requests."""

@@ -514,6 +514,22 @@ async def test_a_page_that_takes_nothing_gives_its_place_to_another(
     assert not [one for one in caplog.messages if "page" in one]
 
 
+async def test_a_page_too_many_names_what_to_close(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its WebSocket alone would be refused without a reason that a browser shows."""
+    monkeypatch.setattr(server, "MAX_PAGES", 1)
+    viewer = Viewer(nowhere(), robot="demo")
+    async with viewer.serving(port=0) as url:
+        async with page(url) as socket:
+            await heard(socket, of_type("status"))
+            status, _, text = await fetch(url)
+            assert (status, text[:24]) == (503, b"1 pages are open already")
+            with pytest.raises(InvalidStatus, match="503"):
+                async with page(url):
+                    pass
+        await until(lambda: viewer._pages == 0)
+        assert (await fetch(url))[0] == 200
+
+
 async def test_pages_that_sleep_do_not_hold_up_the_end() -> None:
     viewer = Viewer(nowhere(), robot="demo")
     async with AsyncExitStack() as stack:
