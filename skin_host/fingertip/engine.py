@@ -389,6 +389,10 @@ class FingertipEngine:
             zero = zeros.get(name)
             state.tip.use(zero)
             state.zero_scale = None if zero is None else zero.full_scale
+            noise_words = np.zeros(CHANNELS)
+            if zero is not None and zero.full_scale is not None:
+                noise_words = zero.noise / (zero.full_scale / ZERO_WORD)
+            state.frozen.judge(noise_words)
             self._note_touch(state)
         return events
 

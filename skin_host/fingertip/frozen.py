@@ -2,6 +2,9 @@
 Pure.
 """
 
+import numpy as np
+from numpy.typing import NDArray
+
 from skin_host.bus.strain import Wrench
 
 #: Force or torque is frozen after its three channels were repeated so many times in a row. Real and
@@ -11,6 +14,11 @@ from skin_host.bus.strain import Wrench
 REPEATS = 250
 #: What was sent is measured after so many changes in a row: fewer may be of damaged frames.
 OTHERS = 3
+#: A channel is judged by itself if it had so much noise at rest (words, rms, rounding included):
+#: less may be that of a load between two words (0.5 then), which does not change in the middle of
+#: one. So much noise repeats half of the samples there, and 0.5^250 is 10^-75.
+LEAST_NOISE_WORDS = 0.6
+_CHANNELS = [f"{half} along {axis}" for half in ("force", "torque") for axis in "xyz"]
 
 
 class Frozen:
@@ -24,28 +32,53 @@ class Frozen:
     noise than that cannot be distinguished from none: such a board is trusted while its load
     changes, and is frozen at rest.
 
+    A single channel whose amplifier has stopped leaves the others changing. It is found if it had
+    noise when the zero was taken, see `judge`.
+
     What is at the end of a board's range is constant too, but saturated.
     """
 
     def __init__(self) -> None:
-        self._halves = {"force": _Half(), "torque": _Half()}
+        self._halves = {"force": _Values(), "torque": _Values()}
+        #: Channels that are judged by themselves, by their number.
+        self._channels: dict[int, _Values] = {}
+
+    def judge(self, noise_words: NDArray[np.float64]) -> None:
+        """Judge channels by themselves from now on that had enough noise at rest.
+
+        Args:
+            noise_words: float64[6], rms, in words of the board; 0 where it is not known.
+        """
+        numbers = np.flatnonzero(noise_words >= LEAST_NOISE_WORDS).tolist()
+        self._channels = {n: self._channels.get(n) or _Values(changes=True) for n in numbers}
 
     @property
     def trusted(self) -> bool:
-        """Whether both have changed since the start or the last doubt, and are not repeated."""
-        return self._halves["force"].changes and self._halves["torque"].changes
+        """Whether both have changed since the start or the last doubt, and no channel is
+        repeated.
+        """
+        halves = self._halves["force"].changes and self._halves["torque"].changes
+        return halves and all(channel.changes for channel in self._channels.values())
 
     @property
     def repeated(self) -> list[str]:
-        """Which are frozen: "force", "torque", both or none."""
-        return [name for name, half in self._halves.items() if half.repeats >= REPEATS]
+        """Which are frozen: "force", "torque", both, or channels of these such as "force along
+        x".
+        """
+        found = [name for name, half in self._halves.items() if half.repeats >= REPEATS]
+        for number, channel in self._channels.items():
+            name = _CHANNELS[number]
+            if channel.repeats >= REPEATS and name.partition(" ")[0] not in found:
+                found.append(name)
+        return found
 
     def take(self, sample: Wrench) -> None:
         """Take the next sample."""
-        for half, values in zip(
-            self._halves.values(), (sample.force_n, sample.torque_nm), strict=True
-        ):
-            half.take(values.tolist(), saturated=sample.saturated)
+        values = [*sample.force_n.tolist(), *sample.torque_nm.tolist()]
+        self._halves["force"].take(values[:3], saturated=sample.saturated)
+        self._halves["torque"].take(values[3:], saturated=sample.saturated)
+        for number, channel in self._channels.items():
+            channel.take(values[number : number + 1], saturated=sample.saturated)
 
     def doubt(self) -> None:
         """The next sample does not continue those before it: it must show again that it changes."""
@@ -53,8 +86,8 @@ class Frozen:
             half.changes, half.others = False, 0
 
 
-class _Half:
-    """The force, or the torque, of one board.
+class _Values:
+    """The force, or the torque, of one board, or one channel of them.
 
     Attributes:
         changes: whether it is known to be measured.
@@ -62,8 +95,8 @@ class _Half:
         others: how many in a row have not since.
     """
 
-    def __init__(self) -> None:
-        self.changes = False
+    def __init__(self, *, changes: bool = False) -> None:
+        self.changes = changes
         self.repeats = 0
         self.others = 0
         self._values: list[float] | None = None

@@ -25,7 +25,7 @@ from skin_host.config.settings import changed, load
 from skin_host.daemon import metrics
 from skin_host.fingertip.engine import FingertipEngine
 from skin_host.fingertip.events import FingertipEvent
-from skin_host.fingertip.frozen import OTHERS, REPEATS, Frozen
+from skin_host.fingertip.frozen import LEAST_NOISE_WORDS, OTHERS, REPEATS, Frozen
 from skin_host.fingertip.health import FingertipHealth, FingertipRecord
 from skin_host.fingertip.service import FingertipPublisher, StrainBoards
 from skin_host.layout import build_layout
@@ -765,14 +765,19 @@ async def test_noise_that_raises_the_threshold_beyond_the_range_is_not_felt_thro
 
 
 class Latch:
-    """A converter of the index finger that repeats its last frames while it `holds`."""
+    """A converter of the index finger that repeats its last frames, or some of their bytes, while
+    it `holds`.
+    """
 
     def __init__(
-        self, bench: Bench, of: tuple[int, ...] = (FORCE_OF_INDEX, TORQUE_OF_INDEX)
+        self,
+        bench: Bench,
+        of: tuple[int, ...] = (FORCE_OF_INDEX, TORQUE_OF_INDEX),
+        octets: slice = slice(None),
     ) -> None:
         self.holds = False
         self._step = bench.robot.step
-        self._of = of
+        self._of, self._octets = of, octets
         self._last: dict[int, Any] = {}
         bench.robot.step = self.step  # type: ignore[method-assign]
 
@@ -782,7 +787,7 @@ class Latch:
         for row, can_id in enumerate(batch.id.tolist()):
             if can_id in self._of:
                 if self.holds and can_id in self._last:
-                    batch.data[row] = self._last[can_id]
+                    batch.data[row, self._octets] = self._last[can_id][self._octets]
                 self._last[can_id] = batch.data[row].copy()
         return batches
 
@@ -901,6 +906,28 @@ async def test_a_board_that_repeats_only_one_of_its_frames_does_not_feel(
     latch.holds = False
     await bench.run(0.1)
     assert (bench.codes(), bench.contact()) == ([], "OFF")
+
+
+@pytest.mark.parametrize(
+    ("of", "what"), [(FORCE_OF_INDEX, "force along z"), (TORQUE_OF_INDEX, "torque along z")]
+)
+async def test_a_board_of_which_one_channel_stands_still_does_not_feel(of: int, what: str) -> None:
+    """Its other channels go on changing: what presses along this one would look like nothing."""
+    bench = Bench({"part": "index", "force_n": [[0.0, 0], [2.5, 0], [2.6, 2.0], [99.0, 2.0]]})
+    latch = Latch(bench, (of,), slice(4, 6))
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(0.2)
+    assert (bench.codes(), bench.contact()) == ([], "OFF")
+    latch.holds = True
+    await bench.run(1.2 * REPEATS * 3e-3)
+    assert (bench.record()["state"], bench.codes()) == ("degraded", ["frozen"])
+    assert f"repeats the same {what} " in bench.record()["sentences"][0]
+    assert (bench.contact(), bench.contact("thumb")) == ("UNKNOWN", "OFF")
+    latch.holds = False
+    await bench.run(2.0)
+    assert (bench.codes(), bench.contact()) == ([], "ON")
 
 
 async def test_a_board_that_has_stopped_sending_is_not_frozen_too() -> None:
@@ -1155,6 +1182,38 @@ def test_what_was_sent_is_trusted_once_force_and_torque_have_changed_several_tim
     for one in changing:
         seen.take(one)
     assert seen.trusted
+
+
+def test_a_channel_by_itself_is_frozen_only_if_it_had_noise_at_rest() -> None:
+    changing = [sample(n, n) for n in range(10, 11 + OTHERS)]
+    still = [
+        Wrench(0, np.array([5.0, n, 1.0]), np.array([n, 1.0, 1.0]), saturated=False)
+        for n in range(REPEATS + 9)
+    ]
+    for noise_words, frozen in ((LEAST_NOISE_WORDS, ["force along x"]), (0.5, [])):
+        seen = Frozen()
+        seen.judge(np.array([noise_words, 9.0, 0.0, 9.0, 0.0, 0.0]))
+        for one in [*changing, *still]:
+            seen.take(one)
+        assert (seen.repeated, seen.trusted) == (frozen, not frozen)
+        for one in changing:
+            seen.take(one)
+        assert (seen.repeated, seen.trusted) == ([], True)
+
+
+@pytest.mark.parametrize("rest_words", [0.0, 0.5])
+@pytest.mark.parametrize("noise_words", [0.0, 0.1, 0.3, 0.52, 2.0])
+def test_noise_of_a_channel_does_not_repeat_for_so_long_by_chance(
+    rest_words: float, noise_words: float
+) -> None:
+    """Judged by the noise at a rest, which shows most where it is between two words."""
+    rng = np.random.default_rng(2)
+    shown = np.round(rest_words + noise_words * rng.normal(size=(1000, 6))).std(axis=0)
+    seen = Frozen()
+    seen.judge(shown)
+    for words in np.round(noise_words * rng.normal(size=(20 * REPEATS, 6))):
+        seen.take(Wrench(0, words[:3], words[3:], saturated=False))
+        assert not any("along" in name for name in seen.repeated)
 
 
 def test_a_board_at_the_end_of_its_range_is_saturated_and_not_frozen() -> None:
