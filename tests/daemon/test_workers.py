@@ -181,29 +181,59 @@ class Ends:
         return self.returncode
 
 
+class Started:
+    """Takes the place of the processes that workers run in, and of the signals to their parent.
+
+    Args:
+        monkeypatch: ends that.
+        kind: of the processes.
+        on_start: called after each start with the descriptors that were passed to it.
+
+    Attributes:
+        daemons: that were started.
+        on_signal: what a signal to the parent does.
+    """
+
+    def __init__(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        kind: Callable[[], Ends] = Ends,
+        on_start: Callable[[list[int]], object] = lambda _: None,
+    ) -> None:
+        self.daemons: list[Ends] = []
+        self.on_signal: dict[int, Callable[[], object]] = {}
+        self._kind, self._on_start = kind, on_start
+        monkeypatch.setattr(asyncio.get_running_loop(), "add_signal_handler", self._take)
+        monkeypatch.setattr(asyncio, "create_subprocess_exec", self._start)
+
+    async def two(self) -> asyncio.Task[int]:
+        """Run two workers; return once both are started."""
+        running = asyncio.create_task(workers.run({"main-1": ["run"], "main-2": ["run"]}))
+        await until(lambda: len(self.daemons) == 2)
+        return running
+
+    def _take(self, number: int, handler: Callable[..., object], *args: object) -> None:
+        self.on_signal[number] = lambda: handler(*args)
+
+    async def _start(self, *_: object, pass_fds: list[int], **__: object) -> Ends:
+        self.daemons.append(self._kind())
+        self._on_start(pass_fds)
+        return self.daemons[-1]
+
+
 @pytest.mark.parametrize("asked", [signal.SIGTERM, signal.SIGINT])
 @pytest.mark.parametrize("started", [1, 2, 3])
 async def test_a_stop_while_daemons_are_started_reaches_each_of_them(
     started: int, asked: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also the one that is being started, and no other is started after it."""
-    on_signal: dict[int, Callable[[], object]] = {}
-    daemons: list[Ends] = []
-
-    def take(number: int, handler: Callable[..., object], *args: object) -> None:
-        on_signal[number] = lambda: handler(*args)
-
-    async def start(*_: object, **__: object) -> Ends:
-        daemons.append(Ends())
-        if len(daemons) == started:
-            on_signal[asked]()
-        return daemons[-1]
-
-    monkeypatch.setattr(asyncio.get_running_loop(), "add_signal_handler", take)
-    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    fakes = Started(
+        monkeypatch,
+        on_start=lambda _: fakes.on_signal[asked]() if len(fakes.daemons) == started else None,
+    )
     async with asyncio.timeout(PATIENCE_S):
         assert await workers.run({f"main-{number}": ["run"] for number in (1, 2, 3)}) == 0
-    assert [daemon.signals for daemon in daemons] == [[asked]] * started
+    assert [daemon.signals for daemon in fakes.daemons] == [[asked]] * started
 
 
 async def test_a_second_stop_ends_every_daemon_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,56 +245,30 @@ async def test_a_second_stop_ends_every_daemon_at_once(monkeypatch: pytest.Monke
             if number == signal.SIGKILL:
                 self._ended.set()
 
-    on_signal: dict[int, Callable[[], object]] = {}
-    daemons: list[Hangs] = []
-
-    def take(number: int, handler: Callable[..., object], *args: object) -> None:
-        on_signal[number] = lambda: handler(*args)
-
-    async def start(*_: object, **__: object) -> Hangs:
-        daemons.append(Hangs())
-        return daemons[-1]
-
-    monkeypatch.setattr(asyncio.get_running_loop(), "add_signal_handler", take)
-    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
-    running = asyncio.create_task(workers.run({"main-1": ["run"], "main-2": ["run"]}))
-    await until(lambda: len(daemons) == 2)
-    on_signal[signal.SIGHUP]()
-    on_signal[signal.SIGINT]()
-    on_signal[signal.SIGTERM]()
+    fakes = Started(monkeypatch, Hangs)
+    running = await fakes.two()
+    fakes.on_signal[signal.SIGHUP]()
+    fakes.on_signal[signal.SIGINT]()
+    fakes.on_signal[signal.SIGTERM]()
     assert await asyncio.wait_for(running, PATIENCE_S) == 1
     wanted = [signal.SIGHUP, signal.SIGINT, signal.SIGKILL]
-    assert [daemon.signals for daemon in daemons] == [wanted] * 2
+    assert [daemon.signals for daemon in fakes.daemons] == [wanted] * 2
 
 
 async def test_the_watchdog_ends_the_worker_that_hangs_where_it_hangs_and_the_others_in_good_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """systemd sends SIGABRT to their parent alone, whose own stack shows nothing."""
-    on_abort: list[Callable[[], object]] = []
-    daemons: list[Ends] = []
     notified: list[int] = []
-
-    def take(number: int, handler: Callable[..., object], *_: object) -> None:
-        if number == signal.SIGABRT:
-            on_abort.append(handler)
-
-    async def start(*_: object, pass_fds: list[int], **__: object) -> Ends:
-        notified.extend(map(os.dup, pass_fds))
-        daemons.append(Ends())
-        return daemons[-1]
-
-    monkeypatch.setattr(asyncio.get_running_loop(), "add_signal_handler", take)
-    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
-    running = asyncio.create_task(workers.run({"main-1": ["run"], "main-2": ["run"]}))
-    await until(lambda: len(daemons) == 2)
+    fakes = Started(monkeypatch, on_start=lambda fds: notified.extend(map(os.dup, fds)))
+    running = await fakes.two()
     os.write(notified[0], b"WATCHDOG=1")
     await asyncio.sleep(0.05)
-    on_abort[0]()
+    fakes.on_signal[signal.SIGABRT]()
     await asyncio.wait_for(running, PATIENCE_S)
     for descriptor in notified:
         os.close(descriptor)
-    assert [daemon.signals[0] for daemon in daemons] == [signal.SIGTERM, signal.SIGABRT]
+    assert [daemon.signals[0] for daemon in fakes.daemons] == [signal.SIGTERM, signal.SIGABRT]
 
 
 @pytest.mark.parametrize("number", ["SIGTERM", "SIGINT"])
@@ -297,22 +301,15 @@ async def test_a_worker_that_does_not_end_in_time_is_named_and_killed(
     class Hangs(Ends):
         def send_signal(self, number: int) -> None:
             self.signals.append(number)
-            if number == signal.SIGKILL or self is daemons[0]:
+            if number == signal.SIGKILL or self is fakes.daemons[0]:
                 self._ended.set()
 
-    daemons: list[Hangs] = []
-
-    async def start(*_: object, **__: object) -> Hangs:
-        daemons.append(Hangs())
-        return daemons[-1]
-
-    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    fakes = Started(monkeypatch, Hangs)
     monkeypatch.setattr(workers, "STOP_S", 0.05)
-    running = asyncio.create_task(workers.run({"main-1": ["run"], "main-2": ["run"]}))
-    await until(lambda: len(daemons) == 2)
-    daemons[0].send_signal(signal.SIGTERM)
+    running = await fakes.two()
+    fakes.daemons[0].send_signal(signal.SIGTERM)
     assert await asyncio.wait_for(running, PATIENCE_S) == 1
-    assert daemons[1].signals == [signal.SIGTERM, signal.SIGKILL]
+    assert fakes.daemons[1].signals == [signal.SIGTERM, signal.SIGKILL]
     assert [one.getMessage() for one in caplog.records] == [
         "main-2: not ended within 0.05 s; killed"
     ]
@@ -322,16 +319,9 @@ async def test_a_worker_that_is_killed_is_named(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Where memory is short the kernel kills it, and the service ends for no other reason."""
-    daemons: list[Ends] = []
-
-    async def start(*_: object, **__: object) -> Ends:
-        daemons.append(Ends())
-        return daemons[-1]
-
-    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
-    running = asyncio.create_task(workers.run({"main-1": ["run"], "main-2": ["run"]}))
-    await until(lambda: len(daemons) == 2)
-    daemons[1].send_signal(signal.SIGKILL)
+    fakes = Started(monkeypatch)
+    running = await fakes.two()
+    fakes.daemons[1].send_signal(signal.SIGKILL)
     assert await asyncio.wait_for(running, PATIENCE_S) == 1
     (line,) = [record.getMessage() for record in caplog.records]
     assert line.startswith("main-2: ended by signal 9 (Killed); all workers end with it")
