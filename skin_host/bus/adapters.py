@@ -7,6 +7,7 @@ What an adapter's library may wait in for ever (opening, sending, closing) is do
 import asyncio
 import logging
 import os
+import select
 import socket
 from collections.abc import Mapping
 from concurrent.futures import Future
@@ -49,6 +50,11 @@ MOST_UNREADABLE = 8
 LONGEST_LINE = 4096
 #: Their libraries stamp a frame when they are asked for it.
 STAMPED_WHEN_READ = frozenset({"iscan", "neousys", "robotell", "seeedstudio", "slcan"})
+#: Their libraries read a serial line byte by byte, and wait for each that has not come yet,
+#: whatever time they are given.
+OF_BYTES = frozenset({"seeedstudio", "serial", "slcan"})
+#: Their libraries number adapters, and take no text for a number.
+NUMBERED = frozenset({"gs_usb", "neousys"})
 #: The time of day was set where it has moved so much more than the time since the computer's start.
 CLOCK_SET_NS = 100_000_000
 #: Opening may take so long: a serial adapter takes 2 s. Closing is waited for this long.
@@ -158,7 +164,10 @@ class AdapterPort(Port):
         else:
             try:
                 for _ in range(CAPACITY):
-                    message = self._receive(self._bus)
+                    waits = self._waits()
+                    message = None if waits is False else self._receive(self._bus)
+                    if message is None and waits:
+                        continue  # an acknowledgement, noise, or the begin of a frame
                     if message is None:
                         emptied_ns = self._clock.now_ns()
                         break
@@ -269,6 +278,22 @@ class AdapterPort(Port):
             self._unreadable = 0
         return message
 
+    def _waits(self) -> bool | None:
+        """Return whether a byte waits to be read; None where that is not known, and does not count.
+
+        Raises:
+            BusError, can.CanError, OSError: the adapter is gone. Not each library shows that.
+        """
+        descriptor = self.fileno() if self._settings.interface in OF_BYTES else None
+        if descriptor is None or descriptor < 0:
+            return None
+        line = select.poll()
+        line.register(descriptor, select.POLLIN)
+        events = sum(event for _, event in line.poll(0))
+        if events & (select.POLLHUP | select.POLLERR):
+            raise BusError("it was unplugged")
+        return events != 0
+
     def _wanted(self, message: can.Message) -> bool:
         # python-can's own filters are not used: with a filter, `recv(0)` returns None for a frame
         # that does not pass, even if others wait.
@@ -358,6 +383,7 @@ def no_answer(name: str, settings: Bus) -> BusError:
 
 def open_bus(name: str, settings: Bus) -> can.BusABC:
     options = {"bitrate": settings.bitrate} | settings.options
+    channel, numbered = settings.channel, settings.interface in NUMBERED
     where = f'bus "{name}": {settings.interface} {settings.channel}'
     if settings.interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted(can.VALID_INTERFACES))
@@ -367,7 +393,9 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
             # Without, `recv(0)` returns None for a frame of CAN FD, even if others wait.
             options["fd"] = True
         if settings.interface == SOCKETCAND and {"host", "port"} <= options.keys():
-            _await_greeting(settings.options)
+            # As text, its client would try to connect for 10 s, at full load, and then again.
+            options["port"] = int(str(options["port"]))
+            _await_greeting(options)
         if settings.interface == MULTICAST:
             from skin_host.bus.multicast import MulticastBus
 
@@ -381,7 +409,7 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
         else:
             bus = can.Bus(
                 interface=settings.interface,
-                channel=settings.channel,
+                channel=int(channel) if numbered and channel.isdecimal() else channel,
                 ignore_config=True,
                 **options,  # type: ignore[arg-type]
             )
@@ -396,6 +424,10 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
             absent = f"python-can[{extra}]" if extra else ""
         elif isinstance(error, TypeError):  # of its arguments, which are these
             why += f"; python-can's {settings.interface} takes them from [buses.{name}.options]"
+        elif isinstance(error, NameError):  # python-can then lacks its functions
+            why = "the library of its maker is not installed"
+        elif settings.interface == MULTICAST and isinstance(error.__cause__, OSError):
+            why += f": {error.__cause__.strerror}; wanted a multicast address, and a route to it"
         if absent:
             why += f"; mend it with: pip install '{absent}'"
         raise BusError(f"{where}: cannot be opened: {why}") from None

@@ -92,7 +92,8 @@ class Assembled(NamedTuple):
 class AssemblerCounters(FrameCounters):
     """Counts all frames that did not become part of a sweep, and everything that was missing."""
 
-    #: Frames of a triangle that was no longer awaited, too late for their sweep.
+    #: Frames of a triangle that was no longer awaited, too late for their sweep, and those that had
+    #: waited for them.
     late: int = 0
     #: Frames that came twice in a row.
     doubled: int = 0
@@ -441,7 +442,7 @@ class Assembler:
                 or state.sent != state.awaited
                 or order.missing[0] != state.awaited
                 or last_ns - first_ns > periods.sure_ns
-                or 0 < 2 * (first_ns - state.sent_first_ns) < periods.period_ns
+                or 0 <= 2 * (first_ns - state.sent_first_ns) < periods.period_ns
                 or state.last_place == places[0]
             ):
                 return 0
@@ -568,10 +569,11 @@ class Assembler:
             if not (bit & state.sent or begins) and is_near:
                 # Its sweep was returned without it: the triangle was not awaited, or the frame was
                 # held up for longer than a sweep is waited for.
-                self.counters.late += 1
-                state.lone &= ~(bit << TRIANGLES | bit >> TRIANGLES)
+                other = bit << TRIANGLES | bit >> TRIANGLES
+                self.counters.late += 1 + (state.lone & other != 0)
+                state.lone &= ~other
                 return False
-            if bit & state.sent and 0 < 2 * since_ns < periods.period_ns:
+            if bit & state.sent and 0 <= 2 * since_ns < periods.period_ns:
                 state.crowded = True
             if state.lone:
                 self._count_lone(state)

@@ -11,6 +11,8 @@ from skin_host.bus.commands import (
     SetBoardConfig,
     SetTriangleConfig,
 )
+from skin_host.bus.compensation import ERGO_HAND
+from skin_host.bus.wire import TRIANGLES
 from skin_host.layout import BoardLayout, TriangleLayout
 
 MTB3_GAP_PERIODS = 2.5
@@ -149,11 +151,18 @@ class BoardRecord:
 def configuration(board: BoardLayout, triangles: list[TriangleLayout]) -> list[Message]:
     """Return the commands 4D and 50 that set up a board; runs of equal triangles share one
     command.
+
+    An ergoCub hand that has run since it was switched on keeps the settings of a triangle with
+    another one, and shifts a triangle's values as that other one is set up. So all get the
+    same first, also those that are not fitted.
     """
     settings = board.settings
     commands: list[Message] = [
         SetBoardConfig(settings.skin_type, settings.period_ms, settings.no_load)
     ]
+    if settings.effective_skin_type == ERGO_HAND and triangles:
+        usual = triangles[0]
+        commands.append(SetTriangleConfig(0, TRIANGLES - 1, usual.shift, 0, usual.cdc_offset))
     run: SetTriangleConfig | None = None
     for triangle in sorted(triangles, key=lambda triangle: triangle.number):
         alike = (

@@ -21,7 +21,8 @@ NO_GAIN = (0,) * TAXELS
 #: The taxels whose change represents the temperature.
 THERMAL_TAXEL = 6
 THERMAL_TAXEL_PALM = 11
-#: An ergoCub hand (skin type 3) compensates its triangles from this one on.
+#: Skin type of an ergoCub hand, which compensates its triangles from this one on.
+ERGO_HAND = 3
 FIRST_HAND_TRIANGLE = 5
 
 
@@ -32,7 +33,7 @@ def thermal_gains(skin_type: int, triangle: int) -> tuple[tuple[int, ...], int]:
     """
     if skin_type == 0:
         return GAIN, THERMAL_TAXEL
-    if skin_type == 8 or (skin_type == 3 and triangle >= FIRST_HAND_TRIANGLE):
+    if skin_type == 8 or (skin_type == ERGO_HAND and triangle >= FIRST_HAND_TRIANGLE):
         return GAIN_V2, THERMAL_TAXEL
     return NO_GAIN, THERMAL_TAXEL_PALM
 

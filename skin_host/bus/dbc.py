@@ -47,6 +47,8 @@ _BYTES = {"B": 1, "H": 2, "I": 4}
 _TIMER_US = 3.2
 #: Full scales for words without a unit.
 _WORDS = (ZERO_WORD,) * 3
+#: Nodes that are no board.
+_RESERVED = ("host", "all")
 #: Commands and answers of force/torque boards, besides their streams.
 _STRAIN_COMMANDS = (SetTxMode, SetTransmissionPeriod, GetFullScale)
 _STRAIN_ANSWERS = (FullScale,)
@@ -99,8 +101,9 @@ def dbc_text(
     else:
         tips = fingertips or {}
         bus = _chosen(bus, layout, tips)
-        boards = _boards_of(layout, bus)
-        sensors = _sensors_of(tips, bus, {board.name for board in boards})
+        taken = set(_RESERVED)
+        boards = _boards_of(layout, bus, taken)
+        sensors = _sensors_of(tips, bus, taken)
     lines = [
         'VERSION ""',
         "",
@@ -154,7 +157,7 @@ def _chosen(bus: str | None, layout: Layout, tips: Mapping[str, Fingertip]) -> s
     return bus
 
 
-def _boards_of(layout: Layout, bus: str) -> list[_Board]:
+def _boards_of(layout: Layout, bus: str, taken: set[str]) -> list[_Board]:
     found = []
     for number, board in enumerate(layout.boards):
         if board.settings.bus != bus:
@@ -166,7 +169,8 @@ def _boards_of(layout: Layout, bus: str) -> list[_Board]:
                 first = triangle.first - part.start
                 about = f"{part.name}, taxels {first} to {first + TAXELS - 1}"
                 triangles.append((triangle.number, about))
-        found.append(_Board(_symbol(board.name), board.settings.address, sorted(triangles)))
+        name, address = _symbol(board.name, taken), board.settings.address
+        found.append(_Board(name, address, sorted(triangles)))
     return found
 
 
@@ -174,16 +178,19 @@ def _sensors_of(tips: Mapping[str, Fingertip], bus: str, taken: set[str]) -> lis
     found = []
     for name, tip in tips.items():
         if tip.bus == bus:
-            symbol = _symbol(name)
-            symbol += "_ft" if symbol in taken else ""
-            found.append(_Sensor(symbol, tip.address, tip.full_scale))
+            found.append(_Sensor(_symbol(name, taken, "_ft"), tip.address, tip.full_scale))
     return found
 
 
-def _symbol(name: str) -> str:
-    """Return a name as a DBC file accepts it: an identifier, and not one of two reserved ones."""
-    name = name.replace("-", "_")
-    return name if name[0].isalpha() and name not in ("host", "all") else f"board_{name}"
+def _symbol(name: str, taken: set[str], suffix: str = "_") -> str:
+    """Return a name as a DBC file accepts it, and take it: an identifier that no other node has."""
+    symbol = name.replace("-", "_")
+    if not symbol[0].isalpha() or symbol in _RESERVED:
+        symbol = f"board_{symbol}"
+    while symbol in taken:
+        symbol += suffix
+    taken.add(symbol)
+    return symbol
 
 
 def _skin_signals() -> list[_Signal]:

@@ -504,6 +504,8 @@ def _frame(message: "can.Message") -> tuple[str, Frame] | None:
     data = bytes(message.data)
     if len(data) > 8:
         raise ValueError(f"a frame of {len(data)} bytes; wanted at most 8")
+    if len(data) < min(message.dlc, 8) and not message.is_remote_frame:
+        raise ValueError(f"{len(data)} bytes of a frame of {message.dlc}")
     t_ns = nanoseconds(message.timestamp) if math.isfinite(message.timestamp) else -1
     if not 0 <= t_ns < 2**63:
         raise ValueError(f"a time of {message.timestamp:g} s")
@@ -527,7 +529,13 @@ def _blocks(path: Path) -> Generator[Block, None, None]:
 
 
 class _Lines(io.TextIOWrapper):
-    """A text whose lines have a limited length."""
+    """A text whose lines have a limited length.
+
+    Attributes:
+        is_whole: the last line that was read has an end.
+    """
+
+    is_whole = True
 
     def __next__(self) -> str:  # type: ignore[override]
         line = self.readline()
@@ -539,6 +547,7 @@ class _Lines(io.TextIOWrapper):
         line = super().readline(_LONGEST_LINE)
         if len(line) == _LONGEST_LINE:
             raise ValueError(f"a line of more than {_LONGEST_LINE} characters")
+        self.is_whole = not line or line.endswith("\n")
         return line
 
 
@@ -560,8 +569,10 @@ class _TrcLines(_Lines):
         return line
 
 
-def _reader(path: Path) -> "can.io.generic.MessageReader":
-    """python-can's reader, which would read a line of any length and a container of any size."""
+def _reader(path: Path) -> "tuple[can.io.generic.MessageReader, _Lines | None]":
+    """python-can's reader, which would read a line of any length and a container of any size, and
+    the text that it reads, if it is one.
+    """
     import gzip
 
     import can
@@ -569,19 +580,21 @@ def _reader(path: Path) -> "can.io.generic.MessageReader":
     from skin_host.bus.asc import DatedAscReader
     from skin_host.bus.blf import BoundedBlfReader
     from skin_host.bus.sqlite import BoundedSqliteReader
+    from skin_host.bus.trc import StrictTrcReader
 
     zipped = path.suffix.lower() == ".gz"
     kind = can.io.player.MESSAGE_READERS[_format([one.lower() for one in path.suffixes])]
     if kind is can.BLFReader:
-        return BoundedBlfReader(path)
+        return BoundedBlfReader(path), None
     if kind is can.SqliteReader:
-        return BoundedSqliteReader(path)
+        return BoundedSqliteReader(path), None
     if not issubclass(kind, can.io.generic.TextIOMessageReader):
-        return can.LogReader(path)
+        return can.LogReader(path), None
     file = gzip.open(path) if zipped else path.open("rb")  # noqa: SIM115  # the reader closes it
     kind_of_lines = _TrcLines if kind is can.TRCReader else _Lines
     lines = kind_of_lines(cast(BinaryIO, file), encoding="utf-8-sig", errors="strict")
-    return DatedAscReader(lines) if kind is can.ASCReader else kind(lines)
+    ours = {can.ASCReader: DatedAscReader, can.TRCReader: StrictTrcReader}
+    return ours.get(kind, kind)(lines), lines
 
 
 def _format(suffixes: list[str]) -> str:
@@ -597,11 +610,13 @@ def _messages(path: Path) -> Iterator[Block]:
     frames: list[tuple[str, Frame]] = []
     n = 0
     damage: Exception | None = None
+    lines: _Lines | None = None
     try:
-        with _reader(path) as reader:
+        reader, lines = _reader(path)
+        with reader:
             for message in reader:
-                n += 1
                 frame = _frame(message)
+                n += 1
                 if frame is not None:
                     frames.append(frame)
                 if len(frames) == _BLOCK:
@@ -613,7 +628,8 @@ def _messages(path: Path) -> Iterator[Block]:
                 raise ValueError(f"cut off, {there} of {said} bytes are left")
     except Exception as error:
         # Each reader has its own errors for a file that is not what its name indicates.
-        damage = error
+        is_whole = lines is None or lines.is_whole
+        damage = error if is_whole else UnfinishedError(str(error))
     yield block_of(frames, names, n, damage)
 
 

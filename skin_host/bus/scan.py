@@ -32,8 +32,8 @@ async def scan(bus: Bus) -> list[FoundBoard]:
         BusError: the interface cannot be opened or does not take frames.
     """
     port = open_port("scan", bus, Receive())
-    #: More than one for an address, if boards of different types or firmware share it.
-    found: dict[int, list[FoundBoard]] = {}
+    #: By type and firmware: more than one for an address, if boards of different ones share it.
+    found: dict[int, dict[tuple[str, str | None], FoundBoard]] = {}
     #: Of each board, which halves of which triangles came: a lone one may be no frame of skin.
     halves: dict[int, set[tuple[int, int]]] = {}
     try:
@@ -66,17 +66,16 @@ async def scan(bus: Bus) -> list[FoundBoard]:
                         continue
                     kind = _type_name(answer.board_type)
                     one = FoundBoard(address, kind, version, version is None, [])
-                    if one not in found.setdefault(address, []):
-                        found[address].append(one)
+                    found.setdefault(address, {}).setdefault((kind, version), one)
     finally:
         port.close()
     for address, seen in halves.items():
         triangles = sorted(triangle for triangle, half in seen if half and (triangle, 0) in seen)
         if triangles:
             streaming = FoundBoard(address, "unknown", None, False, [])
-            for record in found.setdefault(address, [streaming]):
+            for record in found.setdefault(address, {("", None): streaming}).values():
                 record.triangles = triangles
-    return [record for address in sorted(found) for record in found[address]]
+    return [record for address in sorted(found) for record in found[address].values()]
 
 
 def scan_table(found: list[FoundBoard], channel: str) -> str:

@@ -17,6 +17,9 @@ PROOF_S = 1.0
 STEADY_S = 0.02
 #: Frames that come from a queue that has not been empty for longer than this have waited.
 BACKLOG_S = 0.1
+#: A frame that seems to have waited for so much longer than since the queue was empty has not, on
+#: whatever way it came: its clock was set back, or begins again.
+LONGEST_WAY_S = 5.0
 #: No frame takes a shorter time on the bus. Reads are planned to be so far apart at most.
 FRAME_NS = 111_000
 LONGEST_NS = 30_000_000
@@ -70,8 +73,10 @@ class Stamps:
         """
         differs_s = now_s - stamp_s
         # After one of another clock, one that waited for long is of that, too.
-        most_s = PROOF_S if self._other_s < math.inf else PLAUSIBLE_S
-        if not abs(differs_s - self._behind_s) <= most_s:
+        ahead_s = most_s = PROOF_S if self._other_s < math.inf else PLAUSIBLE_S
+        if self._since_s > -math.inf and self._emptied_s <= now_s:
+            most_s = min(most_s, LONGEST_WAY_S + now_s - self._emptied_s)
+        if not -ahead_s <= differs_s - self._behind_s <= most_s:
             self._note_other(differs_s, now_s)
             return None
         if self._other_s < math.inf:

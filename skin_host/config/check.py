@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.compensation import THERMAL_TAXEL, thermal_gains
+from skin_host.bus.compensation import ERGO_HAND, THERMAL_TAXEL, thermal_gains
 from skin_host.config.settings import (
     KindSettings,
     Settings,
@@ -236,6 +236,12 @@ def _board_warnings(layout: Layout) -> list[str]:
             warnings.append(
                 f"{where}.skin_type: {board.settings.skin_type} is unknown to an MTB3, which then "
                 "compensates no temperature; wanted 0, 1 or 2"
+            )
+        shifts = [str(shift) for shift in sorted({triangle.shift for triangle in mine})]
+        if skin_type == ERGO_HAND and len(shifts) > 1:
+            warnings.append(
+                f"{where}: its triangles have the shifts {', '.join(shifts)}; the firmware of an "
+                "ergoCub hand mixes them up when it is set up again: wanted one"
             )
         wrong = []
         for triangle in mine:

@@ -279,9 +279,11 @@ class Receive(_Table, frozen=True):
 
     poll_ms: Annotated[float, Meta(ge=0.1, le=1000)] = 4.0
     buffer_bytes: Annotated[int, Meta(ge=65536)] = 4_194_304
-    #: A sweep with missing triangles is closed after this many periods.
-    close_periods: Annotated[float, Meta(ge=0.1, le=10)] = 0.9
-    silent_periods: Annotated[float, Meta(ge=0.1, le=100)] = 4.0
+    #: A sweep with missing triangles is closed after this many periods. A board whose bus is busy
+    #: takes up to half of one to send it.
+    close_periods: Annotated[float, Meta(ge=0.5, le=10)] = 0.9
+    #: A board in order lets one and a half pass where a sweep is late.
+    silent_periods: Annotated[float, Meta(ge=1.5, le=100)] = 4.0
 
 
 class Service(_Table, frozen=True):
@@ -435,7 +437,8 @@ def _check_references(path: Path, settings: Settings) -> None:
         raise wrong("mqtt.frame_hz", seen)
     for key, what in settings.mqtt.wrong_values():
         raise wrong(f"mqtt.{key}", what)
-    addresses: dict[tuple[str, int], str] = {}
+    # By what a bus is, not by its name: two of one channel both receive what one board sends.
+    addresses: dict[tuple[object, int], tuple[str, str]] = {}
     boards: list[tuple[str, str, Board | Fingertip]] = [
         *((f"boards.{name}", f'board "{name}"', board) for name, board in settings.boards.items()),
         *(
@@ -446,9 +449,13 @@ def _check_references(path: Path, settings: Settings) -> None:
     for where, label, board in boards:
         if board.bus not in settings.buses:
             raise wrong(f"{where}.bus", f'no bus "{board.bus}"; {_known(settings.buses)}')
-        twin = addresses.setdefault((board.bus, board.address), label)
+        bus = settings.buses[board.bus]
+        wire = (bus.interface, bus.channel, tuple(sorted(bus.options.items())))
+        twin, twins_bus = addresses.setdefault((wire, board.address), (label, board.bus))
         if twin != label:
             what = f'{board.address} on bus "{board.bus}" is already that of {twin}'
+            if twins_bus != board.bus:
+                what += f": buses.{board.bus}.channel is that of buses.{twins_bus}, {bus.channel}"
             raise wrong(f"{where}.address", what)
     used: dict[tuple[str, int], str] = {}
     if "nodes" in settings.parts:
@@ -480,12 +487,15 @@ def _check_references(path: Path, settings: Settings) -> None:
 
 def _check_fingertips(settings: Settings, wrong: Callable[[str, str], ConfigurationError]) -> None:
     nodes = {part.node for part in settings.parts.values()}
+    covered: dict[str, str] = {}
     for name, tip in settings.fingertips.items():
         where = f"fingertips.{name}"
         if name in settings.parts or name == "nodes":
             raise wrong(where, "the name is taken by another's topics; choose another")
         if tip.array is not None and tip.array not in settings.parts:
             raise wrong(f"{where}.array", f'no part "{tip.array}"; {_known(settings.parts)}')
+        if tip.array is not None and (other := covered.setdefault(tip.array, name)) != name:
+            raise wrong(f"{where}.array", f'"{tip.array}" already covers fingertips.{other}')
         if tip.array is not None and settings.parts[tip.array].node != tip.node:
             raise wrong(f"{where}.node", f'"{tip.node}", but its array belongs to another node')
         if tip.node not in nodes:

@@ -219,7 +219,11 @@ def read_positions(where: str, path: Path, n: int) -> tuple[Floats, Floats]:
         what = f"{where}.positions: {path}: cannot be read: {error.strerror}"
         raise ConfigurationError(what) from None
     except ValueError as error:
-        raise ConfigurationError(f"{where}.positions: {path}: {error}") from None
+        why = str(error).removesuffix(".")
+        raise ConfigurationError(
+            f"{where}.positions: {path}: {why}; wanted {n} rows x y z nx ny nz alone: "
+            "`skin import positions` takes them from a file of an iCub"
+        ) from None
     if table.shape != (n, 6):
         raise ConfigurationError(
             f"{where}.positions: {path}: {table.shape[0]} rows of {table.shape[1]} numbers; "

@@ -46,6 +46,9 @@ class Line:
     def __init__(self, path: str) -> None:
         self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
 
+    def fileno(self) -> int:
+        return self._fd
+
     @property
     def in_waiting(self) -> int:
         n = array.array("i", [0])
@@ -392,6 +395,16 @@ def test_a_server_of_buses_that_misbehaves_fills_no_log_and_the_daemon_ends_when
     assert "Traceback" not in said
     assert len(said) < 5_000
     assert "socketcand can0" in said or "can0 is gone" in said or "did not answer" in said
+
+
+def test_a_server_whose_port_is_given_as_text_is_connected_to() -> None:
+    """Its client tried for 10 s without a pause, and the daemon named no reason."""
+    server = Server(lambda _: [b"< hi >", b"< ok >", b"< ok >"])
+    options: dict[str, object] = {"host": "127.0.0.1", "port": str(server.port)}
+    bus = open_port("left", Bus(interface="socketcand", channel="can0", options=options), Receive())
+    assert bus.state is LinkState.UP
+    bus.close()
+    server.close()
 
 
 @pytest.mark.parametrize("ahead_s", [-300.0, -0.5, -0.02, 0.0, 0.02, 300.0, 1e9])

@@ -8,21 +8,24 @@ import msgspec
 import pytest
 
 from skin_host.bus.answers import Discovered, DiscoveredBootloader, answer_frame
+from skin_host.bus.board import configuration
 from skin_host.bus.boards import Boards
 from skin_host.bus.commands import (
     BoardType,
     Discover,
     Message,
     SetTriangleConfig,
+    SetTxMode,
+    TxMode,
     parse_command,
 )
 from skin_host.bus.wire import FrameBatch, MessageClass, identifier
 from skin_host.clock import SteppedClock
-from skin_host.config.settings import changed, load
+from skin_host.config.settings import Board, Bus, Part, Patch, Settings, changed, load
 from skin_host.health import HealthWatch, Record
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
-from tests.support.board import BoardOnBench
+from tests.support.board import RESTING_FF, BoardOnBench
 from tests.support.stack import ROOT
 from tests.support.stepped import stepped
 
@@ -463,3 +466,36 @@ def test_one_damaged_answer_makes_no_board_one_of_another_model(heard: Heard) ->
     assert ("board_wrong_model", "hand") in heard.told()
     heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), HAND)
     assert ("board_wrong_model", "hand") not in heard.told()
+
+
+def test_an_ergo_hand_that_runs_gets_another_shift_for_all_of_its_triangles() -> None:
+    """Its firmware keeps what a triangle is set up with beside another one. Three fingers were
+    still shifted as before, so that pressures were wrong by a factor, until the robot was off.
+    """
+    bench = BoardOnBench("mtb4", slots=(0, 4, 8, 12, 16), skin_type=3)
+    chips = list(bench.chips.values())
+    for shift in (1, 2, 0):
+        settings = Settings(
+            robot="r",
+            buses={"can0": Bus()},
+            boards={"hand": Board(bus="can0", address=1, skin_type=3)},
+            parts={
+                "hand": Part(
+                    patches=[Patch(board="hand", triangles="0-4", kind="fingertip", shift=shift)]
+                )
+            },
+        )
+        layout = build_layout(settings, CONFIG.parent)
+        commands = configuration(layout.boards[0], list(layout.triangles))
+        for command in [*commands, commands[-1], SetTxMode(TxMode.START)]:
+            bench.say(command)
+            bench.run(0.09)
+        for chip in chips:
+            chip.set_capacitance_ff(0, RESTING_FF + 0.36 * 100)
+        bench.run(0.05)
+        frames = bench.run(0.05)
+        seen = [bench.triangle(frames, number)[0][0] for number in range(5)]
+        assert seen == [240 - (100 >> shift)] * 5
+        for chip in chips:
+            chip.set_capacitance_ff(0, RESTING_FF)
+        bench.run(0.05)

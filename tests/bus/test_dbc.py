@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from skin_host.bus.answers import ANSWERS, Discovered, FirmwareVersion, answer_frame
 from skin_host.bus.commands import (
@@ -203,6 +204,28 @@ def test_a_sensor_with_the_name_of_a_board_gets_one_of_its_own() -> None:
     text = dbc_text(build_layout(settings, CONFIG), fingertips=settings.fingertips)
     database = cantools.database.load_string(text, "dbc", strict=True)
     assert {node.name for node in database.nodes} == {"host", "hand", "hand_ft"}
+
+
+def test_each_board_has_a_name_of_its_own_though_a_dbc_file_has_fewer_letters() -> None:
+    """`arm-1` and `arm_1` both were `arm_1`, so that who looks a frame up by its name got the other
+    board's.
+    """
+    settings = load(CONFIG / "demo.toml")
+    names = dict(zip(settings.boards, ("arm-1", "arm_1", "1"), strict=True))
+    parts = {
+        name: replace(
+            part, patches=[replace(patch, board=names[patch.board]) for patch in part.patches]
+        )
+        for name, part in settings.parts.items()
+    }
+    boards = {names[name]: board for name, board in settings.boards.items()}
+    settings = changed(settings, {"boards": boards, "parts": parts})
+    database = cantools.database.load_string(
+        dbc_text(build_layout(settings, CONFIG)), "dbc", strict=True
+    )
+    assert [node.name for node in database.nodes] == ["host", "arm_1", "arm_1_", "board_1"]
+    messages = [message.name for message in database.messages]
+    assert len(set(messages)) == len(messages)
 
 
 def test_of_several_buses_one_must_be_named() -> None:

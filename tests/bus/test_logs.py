@@ -3,6 +3,7 @@
 import gc
 import gzip
 import io
+import re
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
@@ -337,6 +338,57 @@ def test_cut_files_are_told(tmp_path):
     cut = tmp_path / "cut.blf"
     cut.write_bytes(whole_blf(blf)[:-1000])
     assert "cut off" in message_of(cut)
+
+
+def whole_text(path: Path) -> list[str]:
+    """Write ten frames of eight bytes in the format of a name; return the lines, and their ends."""
+    with can.Logger(path) as logger:
+        for number in range(10):
+            logger.on_message_received(
+                can.Message(
+                    timestamp=1700000000.0 + number,
+                    arbitration_id=0x4E0,
+                    data=bytes([0x40, *range(7)]),
+                    is_extended_id=False,
+                    channel="can0",
+                )
+            )
+    return path.read_text().splitlines(keepends=True)
+
+
+@pytest.mark.parametrize(("suffix", "lost"), [(".asc", 3), (".csv", 4), (".trc", 3)])
+def test_a_line_that_was_cut_is_damage_and_no_shorter_frame(
+    tmp_path: Path, suffix: str, lost: int
+) -> None:
+    """One without its last byte, the status, was taken for one of a board that sends none."""
+    path = tmp_path / f"cut{suffix}"
+    lines = whole_text(path)
+    lines[-5] = f"{lines[-5].rstrip()[:-lost]}\n"
+    path.write_text("".join(lines))
+    assert re.search(r"damaged after frame \d: \d bytes of a frame of 8$", message_of(path))
+
+
+@pytest.mark.parametrize("cut", ["100", "nonsense"])
+def test_a_line_of_a_trc_that_is_no_message_is_damage(tmp_path: Path, cut: str) -> None:
+    """It was passed over, uncounted."""
+    path = tmp_path / "cut.trc"
+    lines = whole_text(path)
+    lines[-5] = f"{cut}\n"
+    path.write_text("".join(lines))
+    assert f'damaged after frame 5: seen "{cut}", wanted a message' in message_of(path)
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".csv", ".trc"])
+def test_a_text_that_ends_in_the_middle_of_a_line_is_read_as_far_as_it_is_whole(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, suffix: str
+) -> None:
+    path = tmp_path / f"cut{suffix}"
+    lines = whole_text(path)
+    if suffix == ".asc":
+        del lines[-1]  # the end of the block
+    path.write_text("".join(lines).rstrip()[:-3])
+    assert sum(len(batch) for batch in read(path)) == 9
+    assert "ends in the middle of a line" in caplog.text
 
 
 def test_error_frames_of_candump_are_no_data_frames(tmp_path):

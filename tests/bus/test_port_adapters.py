@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import math
+import os
 import threading
 import time
 import tracemalloc
@@ -279,6 +280,70 @@ def of_library(interface: str, *messages: can.Message) -> tuple[AdapterPort, lis
 
     port = AdapterPort("left", Bus(interface=interface, channel="0"), Library())
     return port, port.read().id.tolist()
+
+
+class OfBytes(can.BusABC):
+    """A serial adapter as python-can reads one: byte by byte, with a wait for each that has not
+    come yet. A line is a frame by its identifier, or, if that is 0, an acknowledgement.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("line")
+        self.line, self.adapter = os.pipe2(os.O_NONBLOCK)
+        self._begun = b""
+
+    def _recv_internal(self, timeout):
+        if not self._begun.endswith(b"\n"):
+            try:
+                self._begun += os.read(self.line, 1)
+            except BlockingIOError:
+                raise AssertionError("it would wait for the next byte") from None
+        if not self._begun.endswith(b"\n"):
+            return None, False
+        line, self._begun = self._begun.rstrip(), b""
+        frame = can.Message(arbitration_id=int(line, 16), is_extended_id=False)
+        return (None if line == b"0" else frame), False
+
+    def fileno(self):
+        return self.line
+
+    def send(self, msg, timeout=None):
+        pass
+
+
+@pytest.mark.parametrize("interface", ["seeedstudio", "serial", "slcan"])
+def test_what_a_serial_line_has_is_read_at_once_and_nothing_is_waited_for(interface):
+    """Each read of two of them lasted until 1024 frames had come, 1.6 s for a board; behind an
+    acknowledgement frames stayed where they were.
+    """
+    adapter = OfBytes()
+    port = AdapterPort("left", Bus(interface=interface, channel="line"), adapter)
+    assert len(port.read()) == 0
+    os.write(adapter.adapter, b"4e0\n0\n4e1\n4e")
+    assert port.read().id.tolist() == [0x4E0, 0x4E1]
+    assert len(port.read()) == 0
+    os.write(adapter.adapter, b"2\n")
+    assert port.read().id.tolist() == [0x4E2]
+    port.close()
+
+
+def test_a_serial_line_that_was_hung_up_is_an_adapter_that_is_gone():
+    """Seeed's library reads it as a bus that is silent."""
+    adapter = OfBytes()
+    port = AdapterPort("left", Bus(interface="seeedstudio", channel="line"), adapter)
+    os.close(adapter.adapter)
+    assert len(port.read()) == 0
+    assert port.state is LinkState.GONE
+    port.close()
+
+
+def test_an_adapter_that_is_numbered_is_found_by_its_number(monkeypatch):
+    """candleLight's library compared the text with the number of adapters, and failed over that."""
+    opened = []
+    monkeypatch.setattr("can.Bus", lambda **options: opened.append(options["channel"]))
+    for interface, channel in (("gs_usb", "1"), ("gs_usb", "any"), ("kvaser", "1")):
+        open_bus("left", Bus(interface=interface, channel=channel))
+    assert opened == [1, "any", "1"]
 
 
 def test_frames_that_a_library_returns_to_their_sender_are_not_received():
@@ -635,6 +700,25 @@ def test_an_adapter_that_lacks_its_options_names_where_they_are_given():
     wanted = r"'host' and 'port'; .* from \[buses\.left\.options\]"
     with pytest.raises(BusError, match=wanted):
         open_bus("left", Bus(interface="socketcand", channel="can0"))
+
+
+def test_a_group_that_is_no_multicast_address_is_named_as_the_reason() -> None:
+    wanted = "Invalid argument; wanted a multicast address, and a route to it"
+    with pytest.raises(BusError, match=wanted):
+        open_bus("left", Bus(interface="udp_multicast", channel="127.0.0.1"))
+
+
+def test_an_adapter_without_its_makers_library_is_named_as_such(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Kvaser's then lacks the functions that python-can calls."""
+
+    def absent(*_: object, **__: object) -> None:
+        raise NameError("name 'canGetNumberOfChannels' is not defined")
+
+    monkeypatch.setattr("can.Bus", absent)
+    with pytest.raises(BusError, match="the library of its maker is not installed"):
+        open_bus("left", Bus(interface="kvaser", channel="0"))
 
 
 def test_an_adapter_that_does_not_answer_is_named_to_the_emulator_too(

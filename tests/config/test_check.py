@@ -119,6 +119,16 @@ def test_a_skin_type_that_an_mtb3_does_not_know_is_warned_of(skin_type: int) -> 
     )
 
 
+def test_an_ergo_hand_of_two_shifts_is_warned_of() -> None:
+    patches = [
+        {"board": "hand", "triangles": "0-4", "kind": "fingertip", "shift": 0},
+        {"board": "hand", "triangles": "5", "kind": "triangle_10pad", "shift": 2},
+    ]
+    boards = {"hand": {"bus": "can0", "address": 2, "skin_type": 3}}
+    (warning,) = described(boards, {"hand": {"patches": patches}})["warnings"]
+    assert warning.startswith("boards.hand: its triangles have the shifts 0, 2; the firmware of an")
+
+
 def test_an_unused_bus_and_a_board_of_two_daemons_are_warned_of() -> None:
     description = described(
         {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}},
@@ -247,7 +257,10 @@ def test_a_fingertip_is_listed_and_its_samples_load_the_bus() -> None:
 
 def test_two_buses_on_one_channel_are_a_warning():
     buses = {"a": {"channel": "can0"}, "b": {"channel": "can0"}}
-    boards = {name: {"bus": name, "address": 1, "skin_type": 2} for name in buses}
+    boards = {
+        name: {"bus": name, "address": 1 + number, "skin_type": 2}
+        for number, name in enumerate(buses)
+    }
     parts = {name: {"patches": [{"board": name, "triangles": "0"}]} for name in buses}
     (warning,) = described(boards, parts, buses)["warnings"]
     assert warning.startswith("buses.b.channel: can0 is that of buses.a too")

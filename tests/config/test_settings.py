@@ -51,6 +51,10 @@ outline_mm = [[-3, -3], [28, -3], [28, 8], [-3, 8]]
 PATCH = "parts.left_hand.patches[1]"
 TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
 TIP_S = "fingertips.tip."
+COVERED = f'{TIP}"plane"\narray = "left_hand"'
+COPY = '[buses.copy]\ninterface = "virtual"\nchannel = "skin-demo"\n'
+ALREADY = 'on bus "can0" is already that of board "hand"'
+ONE_CHANNEL = "buses.can0.channel is that of buses.copy, skin-demo"
 DEPENDENT = "follows from those before it, or is 0; wanted six independent rows"
 #: Of a matrix whose fifth row is the third minus twice the fourth.
 SINGULAR = np.eye(6) + 0.3 * np.arange(36).reshape(6, 6) ** 2 % 7
@@ -204,6 +208,11 @@ REACHED = "the force that is measured in every direction, by full_scale and matr
         ),
         (
             TOP,
+            f"{TOP}\n[{COVERED}\n[{COVERED.replace('.tip', '.other').replace('3', '4')}",
+            'fingertips.other.array: "left_hand" already covers fingertips.tip',
+        ),
+        (
+            TOP,
             f'{TOP}\n[{TIP}"plane"\narray = "palm"',
             'fingertips.tip.array: no part "palm"; there are: left_hand, left_forearm',
         ),
@@ -251,6 +260,12 @@ REACHED = "the force that is measured in every direction, by full_scale and matr
             TOP,
             f'{TOP}\n[{TIP.replace("3", "13")}"plane"',
             'fingertips.tip.address: 13 on bus "can0" is already that of board "forearm_outer"',
+        ),
+        # Otherwise two parts would show what one board feels.
+        (
+            '[boards.hand]\nbus = "can0"\naddress = 14',
+            f'{COPY}[boards.hand]\nbus = "copy"\naddress = 13',
+            f"boards.forearm_outer.address: 13 {ALREADY}: {ONE_CHANNEL}",
         ),
         (
             TOP,
@@ -338,7 +353,9 @@ def written(folder: Path, key: str, value: object) -> Path:
         ("processing.touch.move_hz", 1e-9),
         ("processing.drift.rate_units_per_s", 1e8),
         ("processing.drift.gain_per_s", 1e8),
+        ("receive.close_periods", 0.4),
         ("receive.silent_periods", 1e-9),
+        ("receive.silent_periods", 1.0),
         ("buses.can0.bitrate", 0),
     ],
 )

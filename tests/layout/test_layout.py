@@ -242,6 +242,10 @@ def test_a_pipe_that_nobody_writes_positions_to_is_not_waited_for(tmp_path: Path
         ("1 2 3 4 5 6\n" * 11, "11 rows of 6 numbers; wanted 12 rows x y z nx ny nz"),
         ("1 2 3\n" * 12, "12 rows of 3 numbers"),
         ("1 2 3 4 5 6\n" * 11 + "1 2 x 4 5 6\n", "could not convert string 'x'"),
+        (
+            "name arm\n[calibration]\n",
+            "wanted 12 rows x y z nx ny nz alone: `skin import",
+        ),
         ("1 2 3 4 5 6\n" * 11 + "1 2 nan 4 5 6\n", "a number that is not finite"),
     ],
 )
