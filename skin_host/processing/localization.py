@@ -53,12 +53,11 @@ MOST_SHARES = 1_000_000
 STRONGEST_WITHIN = 0.25
 #: Pads differ in strength by about this share even after calibration.
 GAIN_SPREAD = 0.03
-#: Error of a pattern half of `STEP_MM` away from the nearest candidate place, in units per unit.
-STEP_SHARE = 0.01
+#: Error of a pattern whose place is up to half of `STEP_MM` away from the candidate, in units per
+#: unit (rms).
+STEP_SHARE = 0.02
 #: Tables of a part that are kept at a time. One has about 0.7 MB with four sizes of probe.
 MOST_TABLE_BYTES = 100_000_000
-#: If the places that explain the readings lie closer together than this, the best is refined.
-SHARP_MM = 0.5
 
 
 class _Table(NamedTuple):
@@ -130,7 +129,7 @@ class TemplateLocalizer:
             )
         ]
         self._centroid = CentroidLocalizer(position_m, noise_units=noise_units, pitch_m=pitch_m)
-        #: Those laid down earlier come first.
+        #: Those used longest ago come first.
         self._tables: dict[int, _Table] = {}
         self._tables_bytes = 0
 
@@ -144,10 +143,8 @@ class TemplateLocalizer:
             return None
         if self._is_wide(mine.tolist()):
             return self._centroid.locate(taxels, units, usable)
-        table = self._tables.get(strongest)
-        if table is None:
-            table = self._lay_down(strongest)
-            self._keep(strongest, table)
+        table = self._tables.pop(strongest, None) or self._laid_down(strongest)
+        self._tables[strongest] = table
         # Each call of numpy costs as much as its work here, so there are few. All is float32: one
         # float64 among these would copy the tables at each touch.
         trust = usable.take(table.pads)
@@ -172,16 +169,19 @@ class TemplateLocalizer:
         total, x, y, squared = (np.exp(match, out=match) @ table.moments).tolist()
         x, y = x / total, y / total
         variance_mm2 = max(squared / total - x * x - y * y, 0.0)
-        if variance_mm2 < SHARP_MM**2:
+        cell_mm2 = table.step_mm**2
+        if variance_mm2 < cell_mm2:
+            # The places that explain the readings are those around one candidate.
             spread += np.float32(self._noise_units**2)
             fine = np.divide(trust, spread, dtype=np.float32)
             refined = _refine(table, place, reading, fine)
             # A pattern that does not change with the place cannot be refined.
-            if refined is not None and refined[2] < variance_mm2 + table.step_mm**2:
-                x, y, variance_mm2 = refined
+            if refined is not None and refined[2] < variance_mm2 + cell_mm2:
+                x, y, of_noise_mm2 = refined
+                # A place that lies somewhere in a cell has this spread by itself.
+                variance_mm2 = of_noise_mm2 + max(variance_mm2 - cell_mm2 / 6.0, 0.0)
             else:
-                # The place lies somewhere in the cell of its candidate.
-                variance_mm2 = max(variance_mm2, table.step_mm**2 / 6.0)
+                variance_mm2 = max(variance_mm2, cell_mm2 / 6.0)
         place_mm = np.array((1.0, x, y)) @ table.frame
         return Location(1e-3 * place_mm, 1e-3 * math.sqrt(variance_mm2 * misfit))
 
@@ -192,12 +192,13 @@ class TemplateLocalizer:
             mask |= 1 << taxel
         return any(mask & self._far[taxel] for taxel in taxels)
 
-    def _keep(self, centre: int, table: _Table) -> None:
-        """Keep the table of a pad, and forget as many of the oldest as leave room for it."""
+    def _laid_down(self, centre: int) -> _Table:
+        """Return a new table of a pad, after as many others are forgotten as leave room for it."""
+        table = self._lay_down(centre)
         self._tables_bytes += table.size_bytes
         while self._tables and self._tables_bytes > MOST_TABLE_BYTES:
             self._tables_bytes -= self._tables.pop(next(iter(self._tables))).size_bytes
-        self._tables[centre] = table
+        return table
 
     def _lay_down(self, centre: int) -> _Table:
         """Return the patterns of all places at which this pad would have about the highest
@@ -214,29 +215,24 @@ class TemplateLocalizer:
         grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         grid = grid[np.hypot(*grid.T) < half_mm]
         # Places much nearer to another pad cannot cover this one most; drop them early.
-        away = np.linalg.norm(grid[:, None] - flat_mm[None], axis=2)
+        away = np.hypot(*_offsets(grid, flat_mm))
         own = int(np.flatnonzero(pads == centre)[0])
-        grid = grid[away[:, own] <= away.min(axis=1) + radius.max()]
+        near_places = away[:, own] <= away.min(axis=1) + radius.max()
         near_pads = away.min(axis=0) < half_mm
+        grid, away = grid[near_places], away[near_places][:, near_pads]
         pads, flat_mm, radius = pads[near_pads], flat_mm[near_pads], radius[pads[near_pads]]
         own = int(np.flatnonzero(pads == centre)[0])
         places, patterns, slopes = [], [], []
         for probe_mm in self._probes_mm:
-            share = covered_share(grid, flat_mm, radius, probe_mm)
+            share = _shares(away, radius, probe_mm)
             near = (share[:, own] > 0.0) & (share[:, own] >= share.max(axis=1) - STRONGEST_WITHIN)
             places.append(grid[near])
             patterns.append(share[near])
-            right, left, up, down = (
-                covered_share(
-                    grid[near] + 0.5 * step_mm * np.array(side), flat_mm, radius, probe_mm
-                )
-                for side in ((1, 0), (-1, 0), (0, 1), (0, -1))
-            )
-            slopes.append(np.stack([right - left, up - down], axis=1) / step_mm)
+            slopes.append(_slopes(grid[near], flat_mm, away[near], radius, probe_mm))
         place_mm = np.concatenate(places)
         pattern = np.concatenate(patterns)
         used = pattern.max(axis=0) > 0.0
-        pattern = pattern[:, used]
+        pattern = pattern[:, used].astype(np.float32)
         moments = np.column_stack([np.ones(len(place_mm)), place_mm, (place_mm**2).sum(axis=1)])
         moments *= np.linalg.norm(pattern, axis=1, keepdims=True)
         return _Table(
@@ -244,11 +240,9 @@ class TemplateLocalizer:
             pads[used],
             place_mm,
             moments.astype(np.float32),
-            np.ascontiguousarray(pattern.T, np.float32),
-            np.ascontiguousarray(2.0 * pattern.T**2, np.float32),
-            np.concatenate([pattern[:, None], np.concatenate(slopes)[:, :, used]], axis=1).astype(
-                np.float32
-            ),
+            np.ascontiguousarray(pattern.T),
+            np.ascontiguousarray(2.0 * pattern.T**2),
+            np.concatenate([pattern[:, None], np.concatenate(slopes)[:, :, used]], axis=1),
             np.concatenate([1e3 * self._position_m[centre : centre + 1], basis[:2]]),
         )
 
@@ -295,21 +289,54 @@ def covered_share(
         pad_radius_mm: float64[pads].
         probe_mm: diameter of the probe.
     """
-    probe_radius = 0.5 * probe_mm
-    distance = np.linalg.norm(place_mm[:, None, :] - pad_mm[None, :, :], axis=2)
-    pad = np.broadcast_to(pad_radius_mm, distance.shape)
-    share = np.where(
-        distance <= np.abs(pad - probe_radius), np.minimum(1.0, (probe_radius / pad) ** 2), 0.0
-    )
-    cut = (distance > np.abs(pad - probe_radius)) & (distance < pad + probe_radius)
-    d, a = distance[cut], pad[cut]
-    b = probe_radius
+    return _shares(np.hypot(*_offsets(place_mm, pad_mm)), pad_radius_mm, probe_mm)
+
+
+def _shares(distance_mm: Floats, pad_radius_mm: Floats, probe_mm: float) -> Floats:
+    """Return the same from distances float64[places, pads]."""
+    a, b = np.broadcast_to(pad_radius_mm, distance_mm.shape), 0.5 * probe_mm
+    cut = _is_cut(distance_mm, a, b)
+    share = np.where(distance_mm <= np.abs(a - b), np.minimum(1.0, (b / a) ** 2), 0.0)
+    d, a = distance_mm[cut], a[cut]
     at_pad = np.arccos(np.clip((d**2 + a**2 - b**2) / (2.0 * d * a), -1.0, 1.0))
     at_probe = np.arccos(np.clip((d**2 + b**2 - a**2) / (2.0 * d * b), -1.0, 1.0))
-    kite = (a + b - d) * (d + a - b) * (d - a + b) * (d + a + b)
-    lens = a**2 * at_pad + b**2 * at_probe - 0.5 * np.sqrt(np.maximum(kite, 0.0))
+    lens = a**2 * at_pad + b**2 * at_probe - 0.5 * np.sqrt(_kite(d, a, b))
     share[cut] = lens / (np.pi * a**2)
     return share
+
+
+def _slopes(
+    place_mm: Floats, pad_mm: Floats, distance_mm: Floats, pad_radius_mm: Floats, probe_mm: float
+) -> Floats32:
+    """How `covered_share` changes with the place along x and y, float32[places, 2, pads], per mm:
+    the lens of two circles shrinks by the length of its chord.
+    """
+    a, b = np.broadcast_to(pad_radius_mm, distance_mm.shape), 0.5 * probe_mm
+    cut = _is_cut(distance_mm, a, b)
+    d, a = distance_mm[cut], a[cut]
+    slopes = np.zeros((len(place_mm), 2, len(pad_mm)), np.float32)
+    for axis, offset in enumerate(_offsets(place_mm, pad_mm)):
+        slopes[:, axis][cut] = -np.sqrt(_kite(d, a, b)) / (np.pi * a**2 * d**2) * offset[cut]
+    return slopes
+
+
+def _offsets(place_mm: Floats, pad_mm: Floats) -> tuple[Floats, Floats]:
+    """Return from each pad to each place, along x and y, float64[places, pads] each, mm."""
+    x: Floats = place_mm[:, 0, None] - pad_mm[:, 0]
+    y: Floats = place_mm[:, 1, None] - pad_mm[:, 1]
+    return x, y
+
+
+def _is_cut(d: Floats, a: Floats, b: float) -> Mask:
+    """Return at which distances circles of radii a and b cut each other."""
+    cut: Mask = (d > np.abs(a - b)) & (d < a + b)
+    return cut
+
+
+def _kite(d: Floats, a: Floats, b: float) -> Floats:
+    """Return the square of distance times common chord of circles that cut each other."""
+    kite: Floats = (a + b - d) * (d + a - b) * (d - a + b) * (d + a + b)
+    return np.maximum(kite, 0.0)
 
 
 def make_localizer(

@@ -105,13 +105,37 @@ def test_where_two_contacts_merge_for_good_the_larger_one_goes_on():
     small, large = {0}, {4, 5, 6}
     whole = set(range(12))
     assert kinds(skin.show(small, large)) == [("begin", 1), ("begin", 2)]
-    (moved,) = skin.show(whole)
-    assert (moved.id, set(moved.taxels)) == (2, whole - small)
+    moved = skin.show(whole)
+    assert {event.event for event in moved} == {"move"}
     for _ in range(MERGED_NS // SWEEP_NS - 1):
         assert {event.event for event in skin.show(whole)} <= {"move"}
     ended, moved = skin.show(whole)
     assert kinds([ended, moved]) == [("end", 1), ("move", 2)]
     assert set(moved.taxels) == whole
+
+
+@pytest.mark.parametrize("firm", [0, 1])
+def test_where_contacts_meet_a_new_taxel_belongs_to_what_presses_hardest_beside_it(firm):
+    """A finger slides along a hand that rests: what it reaches is not the hand's."""
+    skin = Skin()
+    one, between, other = _chain()
+    larger = {other} | set(_near(other)) - set(_near(between)) - {between}
+    assert kinds(skin.show({one}, larger)) == [("begin", 1), ("begin", 2)]
+    firmly = dict.fromkeys([{one}, larger][firm], 60.0) | {between: 50.0}
+    found = {frozenset(one.taxels) for one in skin.show({one, between}, larger, unlike=firmly)}
+    assert frozenset([{one, between}, larger | {between}][firm]) in found
+
+
+@pytest.mark.parametrize(("taxels_away", "continues"), [(1, True), (2, True), (3, False)])
+def test_a_contact_that_slides_over_a_taxel_keeps_its_name(taxels_away, continues):
+    """What it leaves is released some sweeps late, in the sweep in which it is felt again."""
+    skin = Skin()
+    assert kinds(skin.show({0})) == [("begin", 1)]
+    reached = [{0}]
+    for _ in range(taxels_away):
+        reached.append(set().union(*map(_near, reached[-1])) - set().union(*reached))
+    slid = {min(reached[-1])}
+    assert kinds(skin.show(slid)) == ([("move", 1)] if continues else [("end", 1), ("begin", 2)])
 
 
 @pytest.mark.parametrize("sweeps", [1, 5, 12, 25, 40])
@@ -125,16 +149,18 @@ def test_a_taxel_that_flickers_between_two_contacts_makes_no_other(sweeps):
         assert {event.event for event in skin.show({one}, {other}, flicker)} <= {"move"}
 
 
+def _near(taxel):
+    start, end = LAYOUT.neighbour_start[taxel : taxel + 2]
+    return LAYOUT.neighbour[start:end].tolist()
+
+
 def _chain():
     """Three taxels of which the second is the neighbour of both others, which are not."""
-    near = [
-        set(LAYOUT.neighbour[LAYOUT.neighbour_start[taxel] : LAYOUT.neighbour_start[taxel + 1]])
-        for taxel in range(N)
-    ]
+    near = [set(_near(taxel)) for taxel in range(N)]
     for between in range(N):
         for one in near[between]:
             for other in near[between] - near[one] - {one}:
-                return int(one), between, int(other)
+                return one, between, other
     raise AssertionError("no three taxels in a row")
 
 
@@ -207,6 +233,20 @@ def test_a_change_of_pressure_moves_and_noise_does_not():
     skin.show(HERE, kpa=20.0)
     assert skin.show(HERE, kpa=20.5) == []
     assert kinds(skin.show(HERE, kpa=30.0)) == [("move", 1)]
+
+
+def test_a_force_that_grows_beside_a_pad_at_the_end_of_its_scale_is_reported():
+    """The peak stays, and so does the centroid."""
+    skin = Skin()
+    middle_m = LAYOUT.area_mm2 @ LAYOUT.position_m / LAYOUT.area_mm2.sum()
+    middle = int(np.linalg.norm(LAYOUT.position_m - middle_m, axis=1).argmin())
+    reported_n = 0.0
+    for kpa in range(10, 60):
+        events = skin.show(set(range(N)), kpa=float(kpa), unlike={middle: 257.0})
+        reported_n = events[-1].force_n if events else reported_n
+        other = LAYOUT.area_mm2.sum() - LAYOUT.area_mm2[middle]
+        force_n = 1e-3 * (kpa * other + 257.0 * LAYOUT.area_mm2[middle])
+        assert reported_n == pytest.approx(force_n, rel=0.25)
 
 
 def test_moves_come_no_faster_than_wanted():
@@ -407,6 +447,15 @@ def test_where_nothing_is_left_to_feel_the_place_stays():
     (begin,) = skin.show(HERE)
     events = skin.show(HERE, kpa=0.3)
     assert all(event.centroid_m == begin.centroid_m for event in events)
+
+
+def test_a_light_touch_of_pads_in_fine_units_is_where_it_has_slid_to():
+    fine = replace(LAYOUT, unit_ff=LAYOUT.unit_ff / 4)
+    skin = Skin(fine)
+    (begin,) = skin.show({0}, kpa=1.2)
+    (moved,) = skin.show({1}, kpa=1.2)
+    assert begin.centroid_m == pytest.approx(LAYOUT.position_m[0].tolist())
+    assert moved.centroid_m == pytest.approx(LAYOUT.position_m[1].tolist())
 
 
 def test_where_hardly_anything_is_left_to_feel_the_normal_stays():

@@ -220,6 +220,20 @@ def test_a_contact_that_becomes_two_on_the_same_taxels_parts(configured):
     assert [event.event for event in events if event.event != "move"] == ["begin", "begin"]
 
 
+def test_two_presses_whose_pass_is_high_now_and_then_stay_two(configured):
+    settings, layout = configured('localization = "template"')
+    palm = PressedPalm(layout)
+    tracker = ContactTracker(layout, 0, settings)
+    middle = palm.centre_mm.mean(axis=0)
+    two = palm.press((middle - SIDE_MM, 1.0), (middle + SIDE_MM, 0.8))
+    even = replace(two, pressure_kpa=np.where(two.touched, 20.0, 0.0).astype(np.float32))
+    events = []
+    for number in range(100):
+        shown = even if number % 25 == 24 else two
+        events += tracker.step(replace(shown, elapsed_ns=50_000_000 * number))
+    assert [event.event for event in events if event.event != "move"] == ["begin", "begin"]
+
+
 def test_a_contact_that_parts_keeps_its_name_on_the_stronger_side(configured):
     settings, layout = configured('localization = "template"')
     palm = PressedPalm(layout)

@@ -135,6 +135,19 @@ def test_the_template_reaches_its_goal_and_beats_the_published_methods(diameter,
     assert found["template"] < best_published
 
 
+@pytest.mark.parametrize("diameter", [8.0, 10.0, 12.0])
+def test_most_places_of_a_known_probe_are_exact_where_readings_are(diameter):
+    """Between the candidate places its pattern is followed by its slopes."""
+    radius = np.full(len(PADS_MM), RADIUS_MM)
+    localizer = make_localizer("template", POSITION_M, NORMAL, radius, probe_mm=diameter)
+    off_mm = []
+    for place_mm in np.random.default_rng(2).uniform(-6.0, 6.0, (100, 2)):
+        units = 80.0 * covered_share(place_mm[None], PADS_MM, radius, diameter)[0]
+        found = localizer.locate(np.flatnonzero(units > 2.6), units, ALL)
+        off_mm.append(np.linalg.norm(1e3 * found.position_m[:2] - place_mm))
+    assert np.median(off_mm) < 0.01
+
+
 def test_a_template_that_leaves_the_size_open_suits_probes_of_any_size():
     sizes = (6.0, 8.0, 10.0, 12.0)
     for diameter in sizes:
@@ -152,6 +165,13 @@ def test_a_template_of_the_wrong_size_is_worse_than_one_that_leaves_it_open():
 def test_the_said_uncertainty_is_of_the_size_of_the_error(method, diameter):
     error, said = errors_mm(method, diameter)
     assert 0.5 < rms(error) / rms(said) < 2.5
+
+
+@pytest.mark.parametrize("diameter", [6.0, 8.0, 10.0])
+def test_few_places_are_farther_off_than_four_standard_errors(diameter):
+    """Of several sizes of probe that explain the readings, the best is only one."""
+    error, said = errors_mm("template", diameter, 400, probe_mm=(6.0, 8.0, 10.0, 12.0))
+    assert np.mean(error > 4.0 * said) < 0.05
 
 
 def test_a_small_probe_inside_one_pad_is_said_to_be_anywhere_in_it():

@@ -53,16 +53,24 @@ class Places:
         self,
         frame: PressureFrame,
         patches: list[frozenset[int]],
+        reached: list[set[int]],
         neighbours: Sequence[Sequence[int]],
     ) -> list[frozenset[int]]:
-        """Take in a frame and its connected patches; return its contacts."""
+        """Take in a frame and its patches; return its contacts.
+
+        Args:
+            frame: of the part.
+            patches: of touched taxels, each a contact or several.
+            reached: each patch with the untouched taxels that connect it, as it lands or lifts.
+            neighbours: for each taxel of the part its neighbours.
+        """
         self._units = self._curve.units(frame.pressure_kpa)
         self._free = frame.valid.copy()
         contacts = []
-        for patch in patches:
-            taxels = sorted(patch)
-            self._free[taxels] = False
-            contacts += [frozenset(g) for g in separate(taxels, self._units, neighbours)]
+        for patch, whole in zip(patches, reached, strict=True):
+            self._free[list(patch)] = False
+            hills = separate(sorted(whole), self._units, neighbours)
+            contacts += [own for hill in hills if (own := patch.intersection(hill))]
         self._believed = frame.valid
         return contacts
 

@@ -1,7 +1,6 @@
 """Follows the contacts of a part from frame to frame, and reports what changes."""
 
 import math
-from collections import Counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from skin_host.processing.contacts.grouping import Followed, Grouping, Homes
 from skin_host.processing.contacts.held import Held
 from skin_host.processing.contacts.neighbours import Near, Unfelt
 from skin_host.processing.contacts.places import Places
+from skin_host.processing.curves import common_curve
 from skin_host.processing.events import Reason, Touch, Vector
 from skin_host.processing.frame import PressureFrame
 from skin_host.processing.localization_centroid import GEOMETRY_PITCHES
@@ -27,8 +27,9 @@ PRESSED_SHARE = 0.1
 #: A contact without changes is reported this often, so that subscribers know that it lasts.
 ALIVE_NS = 1_000_000_000
 #: Below this peak a contact has almost ended and its place is mostly noise; above it an untouched
-#: taxel may become touched soon.
+#: taxel may become touched soon. In fine units it is so many of them: touches begin at 1.5 or more.
 FELT_KPA = 2.0
+FELT_UNITS = 1.25
 #: Pieces of a contact become separate contacts when they have been apart for this long.
 PARTED_NS = 150_000_000
 #: A piece that feels less than this share of what the contact felt is a remainder of it: noisy
@@ -46,7 +47,7 @@ class ContactTracker:
     With the part's `localization` left at `centroid`, a connected patch of touched taxels is one
     contact at its mean weighted by force. With any other, a patch with several clear maxima is
     several contacts, and each is located from activations. The template's table of a pad is
-    computed when the pad is first the strongest, which takes some 20 ms once (at most a second).
+    computed when the pad is first the strongest, which takes some 10 ms once (at most a second).
 
     Args:
         layout: the skin.
@@ -71,6 +72,8 @@ class ContactTracker:
         self._near: Near = near
         self._neighbours, self._patches = near.lists, near.patches
         self._pitch_m = near.usual_pitch_m
+        unit_kpa = common_curve(layout, settings.processing.pressure).linear[mine][near.pads]
+        self._felt_kpa = float((FELT_UNITS * unit_kpa[unit_kpa > 0.0]).min(initial=FELT_KPA))
         self._position_m = layout.position_m[mine]
         self._normal = layout.normal[mine]
         self._area_mm2 = layout.area_mm2[mine]
@@ -145,11 +148,13 @@ class ContactTracker:
         as_before = self._are_as_before(groups)
         groups = self._joined(groups, felt)
         if self._places is not None:
-            groups = self._places.look(felt, groups, self._neighbours)
+            lightly = set(np.flatnonzero(self._feels(felt) & ~felt.touched).tolist())
+            reached = [self._reach(group, lightly) for group in groups]
+            groups = self._places.look(felt, groups, reached, self._neighbours)
         home = Homes(self._contacts, len(self._neighbours))
         if len(groups) == 1:
             home.note(groups[0], touched)
-        groups = self._kept_apart(groups, home, felt.elapsed_ns)
+        groups = self._kept_apart(groups, home, felt)
         groups = self._kept_whole(groups, home, felt, received)
         names = self._identify(groups, home)
         self._known = Grouping.of(names, groups, home, self._area_mm2, self._position_m)
@@ -169,7 +174,7 @@ class ContactTracker:
         known = set().union(*(contact.taxels for contact in self._contacts.values()))
         if not any(known.isdisjoint(group) for group in groups):
             return groups
-        felt = set(np.flatnonzero(frame.pressure_kpa >= FELT_KPA).tolist()).union(*groups)
+        felt = set(np.flatnonzero(self._feels(frame)).tolist()).union(*groups)
         joined: list[frozenset[int]] = []
         left = list(groups)
         while left:
@@ -187,6 +192,11 @@ class ContactTracker:
         """Return whether each group is a contact that had the same taxels."""
         return {contact.taxels for contact in self._contacts.values()}.issuperset(groups)
 
+    def _feels(self, frame: PressureFrame) -> Mask:
+        """Return which taxels may become touched soon, or are."""
+        feels: Mask = frame.pressure_kpa >= self._felt_kpa
+        return feels
+
     def _reach(self, group: frozenset[int], among: set[int]) -> set[int]:
         """Return the taxels that a group is connected with through others of a set."""
         reached = set(group)
@@ -199,13 +209,15 @@ class ContactTracker:
         return reached
 
     def _kept_apart(
-        self, groups: list[frozenset[int]], home: "Homes", elapsed_ns: int
+        self, groups: list[frozenset[int]], home: "Homes", felt: PressureFrame
     ) -> list[frozenset[int]]:
         """Return the groups, with contacts kept apart that have only just grown together.
 
-        Each keeps its taxels, and new ones belong to the nearest.
+        Each keeps its taxels; a new one belongs to the contact that it is next to.
         """
         if self._are_as_before(groups):
+            for contact in self._contacts.values():
+                contact.merged_ns = None
             return groups
         kept = []
         for group in groups:
@@ -219,32 +231,37 @@ class ContactTracker:
             for name in (largest, *others):
                 contact = self._contacts[name]
                 if contact.merged_ns is None:
-                    contact.merged_ns = elapsed_ns
-                is_apart = name != largest and elapsed_ns - contact.merged_ns < MERGED_NS
+                    contact.merged_ns = felt.elapsed_ns
+                is_apart = name != largest and felt.elapsed_ns - contact.merged_ns < MERGED_NS
                 owner.update(dict.fromkeys(group & contact.taxels, name if is_apart else largest))
-            self._spread(owner, group)
+            self._spread(owner, group, felt.pressure_kpa)
             shares: dict[int, list[int]] = {}
             for taxel in group:
                 shares.setdefault(owner.get(taxel, largest), []).append(taxel)
             kept += map(frozenset, shares.values())
         return sorted(kept, key=min) if len(kept) > 1 else kept
 
-    def _spread(self, owner: dict[int, int], group: frozenset[int]) -> None:
-        """Give each taxel of a group that has no owner, and is connected with one that has, the
-        nearest one: where there are several, that of most of its neighbours.
+    def _spread(
+        self, owner: dict[int, int], group: frozenset[int], kpa: NDArray[np.float32]
+    ) -> None:
+        """Give the taxels of a group that have no owner that of their neighbours, from these on:
+        of several the one of the hardest pressed.
 
         Args:
-            owner: of taxels; those of contacts with more taxels come first.
-            group: the taxels.
+            owner: of taxels. Of equal neighbours that of the first counts.
+            group: the taxels. Those that are not connected with any owner get none.
+            kpa: of all taxels.
         """
         reached = list(owner)
         while reached:
-            ring: dict[int, Counter[int]] = {}
+            ring: dict[int, int] = {}
             for taxel in reached:
                 for other in self._neighbours[taxel]:
-                    if other in group and other not in owner:
-                        ring.setdefault(other, Counter())[owner[taxel]] += 1
-            owner |= {taxel: found.most_common(1)[0][0] for taxel, found in ring.items()}
+                    if other not in group or other in owner:
+                        continue
+                    if other not in ring or kpa[taxel] > kpa[ring[other]]:
+                        ring[other] = taxel
+            owner |= {taxel: owner[beside] for taxel, beside in ring.items()}
             reached = list(ring)
 
     def _kept_whole(
@@ -278,7 +295,7 @@ class ContactTracker:
                 contact.parted_ns = None
                 kept += parts
                 continue
-            least_kpa = max(FELT_KPA, PIECE_SHARE * contact.firm_kpa)
+            least_kpa = max(self._felt_kpa, PIECE_SHARE * contact.firm_kpa)
             strong = [part for part in parts if felt.pressure_kpa[list(part)].max() >= least_kpa]
             if len(strong) < 2:
                 # What noise lifts for a moment is a remainder all the same.
@@ -300,23 +317,27 @@ class ContactTracker:
         """Give each group the name of the contact that it continues, or a new one.
 
         The largest overlap decides; among equal ones the older contact. A group next to the place
-        of a contact continues it too, if nothing overlaps that contact: it slid.
+        of a contact, or one taxel farther, continues it too, if nothing overlaps that contact: it
+        slid, and what it has left is released some sweeps late.
         """
         names: dict[int, int] = {}
-        for slid in (False, True):
-            claims = []
-            for number, group in enumerate(groups):
-                if number in names:
-                    continue
-                taxels = group
-                if slid:
-                    taxels = group.union(*(self._neighbours[taxel] for taxel in group))
-                claims += [(-count, name, number) for name, count in home.overlaps(taxels)]
+        reached = dict(enumerate(groups))
+        for _ in range(3):
+            claims = [
+                (-count, name, number)
+                for number, taxels in reached.items()
+                for name, count in home.overlaps(taxels)
+            ]
             taken = set(names.values())
             for _, name, number in sorted(claims):
                 if number not in names and name not in taken:
                     names[number] = name
                     taken.add(name)
+                    del reached[number]
+            if len(taken) == len(self._contacts):
+                break
+            for number, taxels in reached.items():
+                reached[number] = taxels.union(*(self._neighbours[taxel] for taxel in taxels))
         for number in range(len(groups)):
             if number not in names:
                 names[number] = self._next_id
@@ -367,10 +388,10 @@ class ContactTracker:
                 silent_ns = now_ns - known.reported_ns
                 if not is_received[number] or silent_ns < self._shortest_ns:
                     continue
-            peak = peaks[number]
+            peak, mean = peaks[number], totals[number] / found.area_mm2[number]
             index = found.taxels[number]
             centroid, sigma = None, None
-            kept = before is not None and peak < FELT_KPA
+            kept = before is not None and peak < self._felt_kpa
             if before is not None and kept:
                 centroid, sigma = before.centroid_m, before.sigma_m
             elif totals[number] > 0.0:
@@ -388,7 +409,7 @@ class ContactTracker:
                 before is not None
                 and before.partial is partial
                 and before.beyond >= is_beyond[number]
-                and not _worth_reporting(before, silent_ns, index, peak, centroid)
+                and not _worth_reporting(before, silent_ns, index, (peak, mean), centroid)
             ):
                 continue
             if partial and not kept and centroid is not None and sigma is not None:
@@ -398,7 +419,6 @@ class ContactTracker:
             if not kept and totals[number] > 0.0:
                 span = found.spans[number]
                 normal = self._mean_normal(weight[span], found.order[span], totals[number])
-            area_mm2 = found.area_mm2[number]
             event = Touch(
                 event="begin" if before is None else "move",
                 id=name,
@@ -408,9 +428,9 @@ class ContactTracker:
                 taxels=index,
                 centroid_m=centroid,
                 normal=normal,
-                area_mm2=area_mm2,
+                area_mm2=found.area_mm2[number],
                 peak_kpa=peak,
-                mean_kpa=totals[number] / area_mm2,
+                mean_kpa=mean,
                 force_n=totals[number] * 1e-3,  # kPa mm2 is mN
                 sigma_m=sigma,
                 partial=partial,
@@ -493,14 +513,22 @@ class ContactTracker:
 
 
 def _worth_reporting(
-    reported: Touch, silent_ns: int, taxels: list[int], peak_kpa: float, centroid_m: Vector | None
+    reported: Touch,
+    silent_ns: int,
+    taxels: list[int],
+    kpa: tuple[float, float],
+    centroid_m: Vector | None,
 ) -> bool:
-    """Return whether a contact has changed since its last event, or its next event is due."""
+    """Return whether a contact has changed since its last event, or its next event is due.
+
+    Its pressures are peak and mean: a pad at the end of its scale hides how hard others press.
+    """
     if taxels != reported.taxels or silent_ns >= ALIVE_NS:
         return True
-    reported_kpa = reported.peak_kpa or 0.0
-    if abs(peak_kpa - reported_kpa) > max(PRESSED_KPA, PRESSED_SHARE * reported_kpa):
-        return True
+    for now_kpa, before_kpa in zip(kpa, (reported.peak_kpa, reported.mean_kpa), strict=True):
+        reported_kpa = before_kpa or 0.0
+        if abs(now_kpa - reported_kpa) > max(PRESSED_KPA, PRESSED_SHARE * reported_kpa):
+            return True
     if centroid_m is None or reported.centroid_m is None:
         return centroid_m is not reported.centroid_m
     return math.dist(centroid_m, reported.centroid_m) > MOVED_M
