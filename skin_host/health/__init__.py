@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skin_host.health.describe import ABSENT_SWEEPS, Describer
+from skin_host.health.describe import LOST_SWEEPS, Describer
 from skin_host.health.diagnosis import FoundFault, diagnose
 from skin_host.health.record import Record
 from skin_host.health.watch import Watch
@@ -240,7 +240,7 @@ def _pulse_of_boards(engine: Engine) -> tuple[object, ...]:
     found: tuple[object, ...] = (
         ledger.any_silent and ledger.silent.tobytes(),
         (ledger.sweeps > 0).tobytes(),
-        ledger.all_complete or np.minimum(ledger.absent, ABSENT_SWEEPS).tobytes(),
+        ledger.all_complete or np.minimum(ledger.absent, LOST_SWEEPS).tobytes(),
         (engine.zeros.doubts(), engine.zeros.changes),
         *(counts.tobytes() for counts in events),
     )

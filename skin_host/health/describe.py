@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skin_host.bus.assembler import Assembler
 from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TRIANGLES, StatusError, skin_id
-from skin_host.health.diagnosis import JITTER_SHARE
+from skin_host.health.diagnosis import FEW_HALVES, JITTER_SHARE
 from skin_host.health.record import (
     BoardHealth,
     BusHealth,
@@ -28,7 +28,7 @@ from skin_host.processing.calibration.calibrator import USUAL_SHIFT
 from skin_host.processing.core import Engine
 from skin_host.processing.far_presses import FAR_PADS
 from skin_host.processing.intake import lifted
-from skin_host.processing.masks import Mask, any_of
+from skin_host.processing.masks import Mask, any_of, count_of
 
 if TYPE_CHECKING:
     from skin_host.bus.boards import Boards
@@ -55,12 +55,16 @@ MANY_RESTING = 12
 TOGETHER_SHARE = 0.75
 #: A shift counts for so long though the baselines have followed it.
 FORMER_NS = 3_000_000_000
-#: A triangle is missing when it was absent from this many sweeps in a row.
+#: A triangle is missing when it was absent from this many sweeps in a row; where its bus loses
+#: frames, from so many: of 10 % of the frames, three in a row are some triangle's every second.
 ABSENT_SWEEPS = 3
+LOST_SWEEPS = 12
 #: That a triangle has not changed since its calibration is known after this.
 CONSTANT_NS = 1_000_000_000
 #: A baseline counts as drifting when it has moved by more than this share of its limit.
 DRIFTING_SHARE = 0.25
+#: Faults of triangles whose chips do not answer, or did not when their board was zeroed.
+_UNANSWERED = {"not connected", "no ack", "silenced", "answers again"}
 _COUNTS = (
     "wrong",
     "halves",
@@ -209,14 +213,14 @@ class Describer:
 
     def _all_well(self, board: int) -> bool:
         """Whether no triangle of the board can have a fault: the common case, checked first."""
-        ledger = self._engine.ledger
+        ledger, liveness = self._engine.ledger, self._engine.intake.liveness
         row = ledger.row[board]
         return bool(
             ledger.sweeps[row]
             and ledger.complete(row)
             and not ledger.is_silent(row)
             and not ledger.flagged[row]
-            and not self._of_board(self._engine.intake.liveness.unproven, row).any()
+            and not self._of_board(liveness.unproven | liveness.halted, row).any()
         )
 
     def _awaits(self, board: int, boards: dict[str, "Boards"]) -> bool:
@@ -238,7 +242,7 @@ class Describer:
             return "missing"
         if not ledger.present[row, number]:
             # One lost frame is a fault of the bus, not of the triangle.
-            return "missing" if ledger.absent[row, number] >= ABSENT_SWEEPS else None
+            return "missing" if ledger.absent[row, number] >= self._absent_sweeps(board) else None
         error = int(ledger.error[row, number])
         if error & StatusError.NOT_CONNECTED:
             return "not connected"
@@ -249,7 +253,7 @@ class Describer:
         if liveness.silenced[triangle] and any_of(ledger.far[row, number]):
             # A board sends the zero for a chip that does not answer.
             return "answers again"
-        if liveness.frozen[triangle]:
+        if liveness.frozen[triangle] or liveness.halted[triangle]:
             return "silenced" if liveness.silenced[triangle] else "frozen"
         if liveness.unproven[triangle] and liveness.silenced[triangle]:
             return "silenced"
@@ -262,12 +266,19 @@ class Describer:
             # What pressed one of the two boards as it was zeroed cannot be known.
             return None
         # Single pads are listed with the taxels; only a whole triangle counts here.
-        far = self._far(board, sweep.raw)[number]
+        far = self._far(board, sweep.raw, self._engine.zeros.in_doubt(board))[number]
         many = np.count_nonzero(far) >= FAR_PADS
         other = lifted(sweep.raw[number], far)
         return "out of range" if many or other else None
 
-    def _far(self, board: int, raw: NDArray[np.uint8]) -> Mask:
+    def _absent_sweeps(self, board: int) -> int:
+        """Return from how many sweeps in a row a triangle of a board is absent that is missing."""
+        gained = self._watch.buses[self._layout.boards[board].settings.bus].gained
+        loses = gained.get("halves", 0) >= FEW_HALVES
+        loses |= any(gained.get(lost, 0) for lost in ("dropped", "overflows"))
+        return LOST_SWEEPS if loses else ABSENT_SWEEPS
+
+    def _far(self, board: int, raw: NDArray[np.uint8], doubted: Mask) -> Mask:
         """Return pads bool[16, 12] of a board's last sweep that are far out of range, but for those
         that are pressed, and those that what pressed as it took its zero explains, which is
         reported as `board_in_doubt`: they read far below zero pressure, not above.
@@ -275,10 +286,11 @@ class Describer:
         Args:
             board: of the layout.
             raw: uint8[16, 12], of that sweep.
+            doubted: bool[16, 12], pads of which that is so, or may be.
         """
         row = self._engine.ledger.row[board]
         far: Mask = self._engine.ledger.far[row]
-        found: Mask = far & ~(self._engine.zeros.in_doubt(board) & (raw == 255))
+        found: Mask = far & ~(doubted & (raw == 255))
         if any_of(found):
             found &= ~self._engine.intake.far_presses.pressed(row)
         return found
@@ -296,13 +308,14 @@ class Describer:
             taxels = self._layout.boards[index].taxel_index
             mine = (taxels >= layout.start) & (taxels < layout.stop)
             masks = {
-                "stuck": self._of_board(liveness.stuck, row),
+                "stuck": self._of_board(liveness.stuck & ~liveness.halted[:, None], row),
                 "noisy": self._of_board(liveness.noisy, row),
             }
             sweep = ledger.last[row]
             if sweep is not None and ledger.flagged[row] and row not in ledger.twice:
                 answered = (ledger.error[row] == 0)[:, None]
-                masks["out_of_range"] = self._far(index, sweep.raw) & answered
+                unknown = self._engine.zeros.unknown(index)
+                masks["out_of_range"] = self._far(index, sweep.raw, unknown) & answered
             for kind, mask in masks.items():
                 found[kind][taxels[mine & mask] - layout.start] = True
         pipeline, calibration = self._engine.pipeline, self._engine.calibration
@@ -435,7 +448,7 @@ class Describer:
             "jitter_ms": jitter_ms,
             "rezeros": int(ledger.rezeros[row]),
             "excess": int(ledger.excess[row]),
-            "in_doubt": int(np.count_nonzero(self._engine.zeros.in_doubt(index))),
+            "in_doubt": self._in_doubt(index),
         }
         manager = boards.get(board.settings.bus)
         if manager is not None:
@@ -469,6 +482,18 @@ class Describer:
         )
         record["twice"] = row in ledger.twice and not ledger.is_silent(row)
         return record
+
+    def _in_doubt(self, index: int) -> int:
+        """Return of how many taxels of a board the zero is unknown because they were touched; not
+        of chips that do not answer, or did not when their board was zeroed: what it takes for their
+        zero is none.
+        """
+        of_triangles = count_of(self._engine.zeros.unknown(index))
+        return sum(
+            int(of_triangles[number])
+            for number in np.flatnonzero(of_triangles).tolist()
+            if self._triangle_fault(index, number) not in _UNANSWERED
+        )
 
     def _is_held_up(self, index: int, period_ms: float) -> bool:
         """Whether a board's intervals scatter because its sweeps wait for those of more urgent

@@ -68,7 +68,8 @@ _TRIANGLE_SENTENCES = {
         "answers again, but its board was zeroed while it did not; set the board up again while "
         "nothing touches it: skin command configure --board {board}"
     ),
-    "frozen": "repeats the same bytes for longer than chance allows: its chip has stopped",
+    "frozen": "repeats the bytes of most pads, or of all, for longer than chance allows: its chip "
+    "has stopped, or lost its set-up: switch the board off and on, then calibrate",
     "constant": "did not change during the calibration and has not changed since",
     "out of range": "reads far outside its range on all pads",
 }
@@ -141,7 +142,7 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[FoundFau
                 "taxel_unproven",
                 record["part"],
                 f"{named(unexplained)} of {record['part']}: not valid: the pad failed when "
-                "calibrated under pressure, or jumps",
+                "calibrated under pressure, or jumps, or its chip has yet to show that it lives",
             )
         )
     faults += _output(record.get("output"), lost_lately)
@@ -155,7 +156,7 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[FoundFau
 
 def _hides_many(fault: FoundFault) -> bool:
     """Whether a fault is a reason for which taxels are not valid that are not listed one by one."""
-    return fault.code.startswith(("bus_", "board_", "triangle_"))
+    return fault.code.startswith(("bus_", "board_", "line", "triangle_"))
 
 
 def _explained(record: Record) -> set[int]:

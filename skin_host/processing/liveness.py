@@ -17,13 +17,15 @@ There are other reasons for repeated bytes. While an iCub's hand holds an object
 much longer than those of the open hand (the IROS 2012 recordings: some pads for 44 sweeps, a whole
 fingertip for 19), so repeats count for less while the board feels a touch.
 
-Single pads are judged in `stuck`.
+Single pads are judged in `stuck`. Where most pads of a triangle are stuck, it is the chip: after a
+failure of its supply, or wrong bits in a set-up, it goes on with one conversion of twelve.
 
 A pad is noisy when it jumps up and down. So does one that a hand taps, for boards that send too
-seldom to see more than one reading of a tap. There what most pads of a triangle do in one direction
-is no jump: what presses moves them together, while the pads of a broken chip read what they like.
-Where most pads of such a chip are noisy although it is known how noisy they are under pressure, its
-connection is broken, as in `erratic`, which sees that where sweeps come faster.
+seldom to see more than two readings of a tap. There what most pads of a triangle do in one
+direction is no jump: what presses moves them together, while the pads of a broken chip read what
+they like. Where most pads of a chip are noisy although it is known how noisy they are under
+pressure, its connection is broken, as in `erratic`, which sees that where sweeps come faster than
+15 times a second.
 
 Much of what a step costs is that its code is found cold. So a sweep by which no decision can change
 waits until the second or third one after it, and then they are taken one after the other.
@@ -87,9 +89,10 @@ CALM_MEAN = 0.1
 NOISE_MEMORY_CONVERSIONS = 8
 #: Boards that send more seldom than this read a hand's fastest taps less than three times each.
 SLOW_S = 1.0 / (3.0 * FASTEST_HZ)
-#: Of their triangles a step is a press, or its end, where so many pads make one two thirds as far
-#: in its direction, and so many times as many as in the other: the pad that is pressed hardest
-#: may be alone. Ten pads that read what they like do that in one step of ten.
+#: Where the rise and the fall of such a tap may be as near to each other as those of a jump, a step
+#: is a press, or its end, if so many pads of the triangle make one two thirds as far in its
+#: direction, and so many times as many as in the other: the pad that is pressed hardest may be
+#: alone. Ten pads that read what they like do that in one step of ten.
 TOGETHER_PADS = 3
 TOGETHER_RATIO = 4
 #: A pad has jumped lately while that mean is above this: for some 25 conversions.
@@ -104,6 +107,8 @@ SPIKE_SIGMAS = 8.0
 #: A spike that has not been counted when so many conversions could not be compared, in a silence or
 #: one here and one there, is over: what is counted is what happens now.
 SPIKE_CONVERSIONS = 25
+#: What is kept whole, or follows from the rest.
+RENEWED = {"spikes", "doubted", "lifeless", "halted"}
 #: Bytes on both sides of a gap of so many sweeps are of one zero, and show whether a chip lives. In
 #: a longer one the board may have restarted.
 FEW_MISSED = 5
@@ -141,6 +146,9 @@ class Liveness:
         unproven: bool[k], triangles that had an error, or were frozen, and have not changed
             enough since; at first all.
         silenced: bool[k], those of them whose last reason was an error.
+        halted: bool[k], triangles most of whose pads are stuck, but for those that were constant
+            when calibrated: the chip is not set up any more, and what the others read is no
+            measure.
         noisy: bool[k, 12], pads that jump up and down much more than when calibrated, and those of
             chips of slow boards whose connection is broken.
         doubted: bool[k, 12], pads that are not valid, or None if all are. Of a noisy temperature
@@ -187,6 +195,7 @@ class Liveness:
         self._rows = None if all_of(fitted) else np.flatnonzero(fitted)
         self._rate: Floats = np.minimum(change_rate(noise_units), MOST_RATE)
         self._triangle_rate: Floats = 1.0 - np.prod(1.0 - self._rate, axis=1)
+        self._moves: Mask = noise_units > 0.0
         self._constant = constant = ~np.any(noise_units > 0.0, axis=1) & fitted
         # Without a calibration, or if a pad was absent from it or its triangle constant, it is not
         # known how much noise is too much.
@@ -198,6 +207,10 @@ class Liveness:
         self._together_units = (2.0 / 3.0 * self._jump_units).astype(np.uint8)
         self._slow: Mask = period_s > SLOW_S
         self._any_slow = any_of(self._slow)
+        #: A step may be followed by the next one after so many sweeps of repeats.
+        step_sweeps = np.ceil(YOUNG_S / period_s).clip(1, 255)
+        self._seldom: Mask = (step_sweeps + 1.0) * period_s > SLOW_S
+        self._any_seldom = any_of(self._seldom)
         #: Pads whose steps show what presses. A board takes the noise of the other off them.
         self._feels: Mask = np.ones(shape, np.bool_)
         self._feels[:, THERMAL_TAXEL] = ~self._compensated.any(axis=1)
@@ -215,10 +228,8 @@ class Liveness:
         #: Triangles whose last bytes show what has changed by the next ones.
         self._present = np.zeros(k, np.bool_)
         self._all_present = False
-        # A step may be followed by the next one after so many sweeps of repeats.
-        sweeps = np.ceil(YOUNG_S / period_s).clip(1, 255).astype(np.uint8)
-        self._step_sweeps = np.repeat(sweeps, PADS).reshape(shape)
-        self._most_step_sweeps = int(sweeps.max(initial=1))
+        self._step_sweeps = np.repeat(step_sweeps.astype(np.uint8), PADS).reshape(shape)
+        self._most_step_sweeps = int(step_sweeps.max(initial=1))
         #: The last far step of each pad: for how many sweeps it still counts, its size and whether
         #: it went up; and for how many sweeps any counts at most.
         self._step_left, self._step_size = (np.zeros(shape, np.uint8) for _ in range(2))
@@ -259,6 +270,7 @@ class Liveness:
         self.unproven: Mask = self._to_show > 0
         self._any_to_show = any_of(self.unproven)
         self.silenced: Mask = np.zeros(k, np.bool_)
+        self.halted: Mask = np.zeros(k, np.bool_)
         self.noisy: Mask = np.zeros(shape, np.bool_)
         self._any_noisy = False
         #: The pads that are noisy themselves.
@@ -431,7 +443,7 @@ class Liveness:
         constant = self._constant & ~rows
         for mine, its in ((self, before), (self._pads, before._pads)):
             for name, array in vars(mine).items():
-                if not isinstance(array, np.ndarray) or name in {"spikes", "doubted", "lifeless"}:
+                if not isinstance(array, np.ndarray) or name in RENEWED:
                     continue
                 if len(array) in {len(boards), len(rows)}:
                     chosen = boards if len(array) == len(boards) else rows
@@ -461,10 +473,13 @@ class Liveness:
         return self._felt
 
     def _doubt(self) -> None:
+        self.halted = self._none
         if not (self._any_to_show or self._pads.any_stuck or self._any_noisy):
             self.doubted = self.lifeless = None
             return
-        self.doubted = self.lifeless = self.unproven[:, None] | self.stuck
+        if self._pads.any_stuck:
+            self.halted = count_of(self.stuck) >= most_of(count_of(self._moves | self.stuck))
+        self.doubted = self.lifeless = (self.unproven | self.halted)[:, None] | self.stuck
         if self._any_noisy:
             compensated = self._compensated & self.noisy[:, THERMAL_TAXEL, None]
             self.doubted = self.lifeless | self.noisy | compensated
@@ -531,7 +546,7 @@ class Liveness:
             up = raw > self._raw
             if self._any_step_left:
                 jump = far & (self._step_left > 0) & (up ^ self._step_up)
-                if self._any_slow:
+                if self._any_seldom:
                     jump &= ~self._moved_together(far, size, up)
         here = None if whole else compared
         if jump is not None and any_of(jump):
@@ -560,7 +575,7 @@ class Liveness:
         rise = count_of(moved & up)[:, None]
         fall = count_of(moved)[:, None] - rise
         same, other = np.where(up, rise, fall), np.where(up, fall, rise)
-        found: Mask = far & self._feels & self._slow[:, None]
+        found: Mask = far & self._feels & self._seldom[:, None]
         found &= (same >= TOGETHER_PADS) & (same >= TOGETHER_RATIO * other)
         return found
 

@@ -6,7 +6,8 @@ pad from every byte, so that the bytes of a stuck pad keep changing. But the tem
 byte shows what was subtracted, up to its rounding: each byte gives bounds of the chip's word, and a
 run of bytes is a repetition as long as one word lies in all of them. The temperature pad's noise
 even helps: words that shift against the bytes' edges leave a working pad less room than a byte
-does.
+does. But where it rests in one byte, and by the board's rounding where it is colder than when the
+board was zeroed, one word may lie in several bytes of a pad, and a repetition shows less.
 
 A pad is stuck when it repeats for longer than chance allows. How often the pad moves
 in general does not show what chance allows. Of a pad that reads 240 in 6 of 10 samples, 239 and
@@ -75,6 +76,14 @@ class Repeats:
         tables = [_words(*kind) for kind in kinds]
         lowest = np.concatenate([lowest for lowest, _ in tables])
         pattern = np.concatenate([pattern for _, pattern in tables])
+        no_load = np.array([one.no_load for one in kinds])
+        #: How many words explain a byte of a pad at most, while warm and while cold, by kind.
+        widest = np.array(
+            [
+                (_most_bits(pattern[: at + 1]), _most_bits(pattern[at + 1 :]))
+                for at, (_, pattern) in zip(no_load, tables, strict=True)
+            ]
+        )
         # Half as long where that is enough, for half of the memory's traffic.
         short = int(pattern.max()) <= np.iinfo(np.uint32).max
         of_words: type[np.signedinteger[Any]] = np.int32 if short else np.int64
@@ -86,10 +95,13 @@ class Repeats:
         self._tells = np.concatenate(
             [(scale > 0) & (scale < 255) | (not any(kind.gain)) for kind in kinds]
         )
-        self._kind = np.array([256 * kinds.index(one) for one in encodings])
+        kind = np.array([kinds.index(one) for one in encodings])
+        self._kind = 256 * kind
         shape = self._gain.shape
         cells = np.array([1 << one.shift for one in encodings], of_words)
         self._cells = np.repeat(cells, shape[1]).reshape(shape)
+        self._no_load = no_load[kind]
+        self._room_units = [widest[kind, side] / self._cells for side in range(2)]
         #: Which words explain a run of bytes: the lowest that the last byte may stand for, and bit
         #: i: that plus i does.
         self._base = np.zeros(shape, of_words)
@@ -135,6 +147,36 @@ class Repeats:
         # The difference of two estimates may have any value where much was subtracted.
         own: Floats = np.sqrt(np.maximum(noise_units**2 - taken**2, noise_units**2 / 4))
         return own
+
+    def room_units(self, noise_units: Floats) -> tuple[Floats, Floats]:
+        """Return within which limits float64[k, 12] a pad may move and still repeat, in units,
+        while it is warmer than when it was zeroed, and colder: 1 without compensation.
+
+        Args:
+            noise_units: float64[k, 12], of the bytes.
+        """
+        if not self._compensated:
+            return np.ones(self._gain.shape), np.ones(self._gain.shape)
+        # While the temperature pad sends one byte, whole bytes of another have a word in common.
+        rests = ~self.dithered(noise_units)
+        warm, cold = (np.where(rests, np.ceil(room), room) for room in self._room_units)
+        return warm, cold
+
+    def dithered(self, noise_units: Floats) -> Mask:
+        """Return pads, bool[k, 12], that the noise of a temperature pad moves against the edges of
+        their bytes, given the noise of the bytes: no place keeps such a pad for longer.
+        """
+        lively: Mask = self.shifted & (noise_units[:, THERMAL_TAXEL, None] >= LIVELY_UNITS)
+        return lively
+
+    def is_cold(self, raw: NDArray[np.uint8]) -> Mask | None:
+        """Return which compensated triangles, bool[k], are colder than when they were zeroed; None
+        if none is.
+        """
+        if not self._compensated:
+            return None
+        cold: Mask = raw[:, THERMAL_TAXEL] > self._no_load
+        return cold if any_of(cold) else None
 
     def step(
         self, raw: NDArray[np.uint8], changed: Mask, within: Mask | None
@@ -215,6 +257,11 @@ def _words(
     return (no_load << shift) + lowest, np.bitwise_or.reduce(patterns, axis=1)
 
 
+def _most_bits(patterns: NDArray[np.uint64]) -> list[int]:
+    """Return how many bits the longest pattern of each pad has, of [256, 12]."""
+    return [int(of_pad.max()).bit_length() for of_pad in patterns.T]
+
+
 #: Triangles: all, or their numbers.
 Rows = slice | NDArray[np.intp]
 
@@ -231,6 +278,9 @@ CALIBRATED_SAMPLES = 100
 #: The assumed share of samples in which a pad moves is at most this, and its noise at least this.
 MOST_RATE = 0.8
 LEAST_NOISE_UNITS = 0.1
+#: A temperature pad whose bytes have less noise may rest in one byte sooner or later, at whose edge
+#: it was calibrated.
+LIVELY_UNITS = 0.54
 #: A quiet pad at the edge between two bytes moves often until it drifts away from there. Its rate
 #: is assumed to be at most this multiple of that of a pad in the middle of a byte.
 RESTING_MARGIN = 1.25
@@ -317,8 +367,14 @@ class StuckPads:
             self._begun = np.broadcast_to(begun, shape).copy()
         self._before = self._begun - 1.0
         self._forget = STEP_SAMPLES * period_s / MEMORY_S
-        resting = share * rate_in_run(repeats.own_noise(noise_units))
-        most = np.where(repeats.shifted, MOST_RATE, RESTING_MARGIN * resting)
+        own_units = repeats.own_noise(noise_units)
+        warm, cold = (rate_in_run(own_units, room) for room in repeats.room_units(noise_units))
+        #: What a repeat shows of a pad that is colder than when it was zeroed, as a share of what
+        #: it does of a warmer one.
+        self._cold_weight = np.ones(shape)
+        np.divide(np.log1p(-cold), np.log1p(-warm), self._cold_weight, where=cold < warm)
+        resting = share * warm
+        most = np.where(repeats.dithered(noise_units), MOST_RATE, RESTING_MARGIN * resting)
         self._most = np.minimum(most, MOST_RATE)
         self._seen = np.full(shape, float(CALIBRATED_SAMPLES))
         self._moved = resting * CALIBRATED_SAMPLES
@@ -381,12 +437,11 @@ class StuckPads:
             gained *= ended
             self._new_seen += gained
             self._new_moved += ended.view(np.int8)
-        if felt is not None:
-            run += felt.weight if told is None else told * felt.weight
-        elif told is None:
-            run += 1.0
-        else:
-            run += told
+        weight = 1.0 if felt is None else felt.weight
+        cold = self._repeats.is_cold(raw)
+        if cold is not None:
+            weight = np.where(cold[:, None], weight * self._cold_weight, weight)
+        run += weight if told is None else told * weight
         run *= np.logical_not(moved, out=self._stays)
         if came is None:
             self._common_samples += 1
@@ -482,7 +537,9 @@ class StuckPads:
             rows = np.flatnonzero(np.repeat(enough, len(unproven) // self._boards))
         stuck, doubted = self.stuck[rows], unproven[rows, None]
         lives = ~stuck & ~doubted
-        keep = np.where(lives, 1.0 - self._forget[rows], 1.0)
+        # A run that goes on replaces nothing: without an end it would always be allowed for longer.
+        learns = lives & (self._new_seen[rows] > 0.0)
+        keep = np.where(learns, 1.0 - self._forget[rows], 1.0)
         self._seen[rows] = self._seen[rows] * keep + np.where(lives, self._new_seen[rows], 0.0)
         self._moved[rows] = self._moved[rows] * keep + np.where(lives, self._new_moved[rows], 0)
         # What a stuck pad shows counts once it lives.
@@ -501,15 +558,15 @@ class StuckPads:
             self.longest[self._unfitted] = np.inf
 
 
-def rate_in_run(noise_units: Floats) -> Floats:
+def rate_in_run(noise_units: Floats, room_units: Floats | float = 1.0) -> Floats:
     """Return how often a pad leaves the byte in which it rests, given the noise of its bytes
-    (units).
+    (units), or the room that it has where one word explains several bytes.
 
-    For a normal distribution in the middle of a byte, 1 - erf(1 / (2 sqrt(2) sigma)): no place
-    between two bytes keeps a pad for longer. Rounding has added 1/12 to the variance.
+    For a normal distribution in the middle of it, 1 - erf(room / (2 sqrt(2) sigma)): no place
+    keeps a pad for longer. Rounding has added 1/12 to the variance.
     """
     sigma = np.sqrt(np.maximum(noise_units**2 - 1.0 / 12.0, LEAST_NOISE_UNITS**2))
-    width = 0.5 / math.sqrt(2.0) / sigma
+    width = 0.5 * room_units / math.sqrt(2.0) / sigma
     return np.array([1.0 - math.erf(one) for one in width.ravel()]).reshape(width.shape)
 
 

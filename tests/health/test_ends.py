@@ -19,6 +19,7 @@ from skin_host.health import LATELY_NS, HealthWatch
 from skin_host.processing.calibration import Verdict
 from skin_host.processing.core import Engine
 from tests.support.fault_bench import FaultBench
+from tests.support.fault_matrix import bench_of
 
 PAGE = (Path(__file__).parents[2] / "docs/operations.md").read_text()
 HERE: dict[str, Any] = {"board": "forearm_outer", "triangle": 3}
@@ -60,6 +61,22 @@ def test_a_fault_of_the_robot_is_over_when_it_is_mended(
     assert code not in {told for told, _ in bench.told}
 
 
+@pytest.mark.parametrize("model", ["mtb3", "mtb4"])
+def test_a_chip_that_has_lost_its_set_up_is_named_as_such_and_none_of_its_pads_stays_valid(
+    model: str,
+) -> None:
+    """It converts one pad and reads as untouched on the others."""
+    bench = bench_of(model, "signal", touched=False)
+    bench.inject("brown_out", board="one", triangle=3)
+    bench.run(12.0)
+    assert not bench.valid["skin"][36:48].any()
+    record = bench.records["skin"]
+    assert ("triangle_frozen", "one/3") in bench.told
+    assert "stuck" not in record["taxel_faults"]
+    (sentence,) = (one for one in record["sentences"] if "triangle 3 of board one" in one)
+    assert "switch the board off and on" in sentence
+
+
 def test_a_chip_that_answers_again_is_not_told_to_be_silent_but_to_need_a_set_up(
     bench: FaultBench,
 ) -> None:
@@ -67,6 +84,7 @@ def test_a_chip_that_answers_again_is_not_told_to_be_silent_but_to_need_a_set_up
     mend = bench.inject("shorted_finger", **HERE)
     bench.run(3.0)
     assert ("line_shorted", "forearm_outer/line0") in bench.told
+    assert "taxel_unproven" not in {code for code, _ in bench.first_told}
     mend()
     bench.run(1.0)
     assert "line_shorted" not in {code for code, _ in bench.told}

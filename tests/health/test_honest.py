@@ -13,6 +13,7 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.health import LATELY_NS, STALLED_NS, HealthWatch
 from skin_host.layout import PadKind
 from tests.support.fault_bench import CONFIG, FaultBench
+from tests.support.fault_matrix import bench_of
 
 OUTPUT: dict[str, Any] = {"connected": True, "touches_dropped": 0, "refused": 0, "last_error": ""}
 
@@ -287,3 +288,49 @@ def test_a_board_that_floods_its_bus_is_named_and_the_other_is_served() -> None:
     bench.run(65.0)
     assert ledger.excess[row] == excess
     assert not bench.told
+
+
+def test_a_chip_that_does_not_answer_is_no_touch_when_its_board_was_zeroed() -> None:
+    """What the board takes for its zero is none, so its pads read anything."""
+    bench = bench_of("mtb4", "signal", touched=False)
+    mend = bench.inject("no_acknowledge", board="one", triangle=3)
+    bench.run(3.0)
+    assert ("board_rezeroed", "one") in bench.told
+    mend()
+    bench.run(6.0)
+    assert ("triangle_answers_again", "one/3") in bench.told
+    assert "board_in_doubt" not in {code for code, _ in bench.first_told}
+
+
+def test_pads_that_wrong_bits_bring_far_below_zero_are_out_of_range_not_zeroed_under_a_touch() -> (
+    None
+):
+    """What lifts stays there for some sweeps."""
+    bench = bench_of("mtb4", "signal", touched=False)
+    bench.inject("slow_rise", board="one", triangle=3)
+    bench.run(0.1)
+    assert set(bench.told) == {("taxel_out_of_range", "skin")}
+
+
+def test_a_triangle_of_a_bus_that_loses_frames_is_missing_where_chance_does_not_explain_it() -> (
+    None
+):
+    """Three of its sweeps in a row are lost now and then; it is enabled all the same."""
+    bench = bench_of("mtb4", "signal", touched=False)
+    bench.inject("frame_loss", bus="can0", value=0.1)
+    bench.run(40.0)
+    assert {code for code, _ in bench.first_told} == {"bus_loses_frames"}
+    step = bench.robot.step
+
+    def without(seconds: float) -> dict[str, FrameBatch]:
+        (batch,) = step(seconds).values()
+        kept = batch.id & 0xFF != 1 << 4 | 3
+        return {
+            "can0": FrameBatch(
+                batch.id[kept], batch.dlc[kept], batch.data[kept], batch.t_ns[kept].copy()
+            )
+        }
+
+    bench.robot.step = without  # type: ignore[method-assign]
+    bench.run(1.0)
+    assert set(bench.told) == {("bus_loses_frames", "can0"), ("triangle_missing", "one/3")}

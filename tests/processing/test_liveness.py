@@ -182,6 +182,45 @@ def test_one_stuck_pad_is_not_valid_and_its_triangle_is() -> None:
     assert not liveness.unproven.any()
 
 
+@pytest.mark.parametrize(
+    ("stuck", "constant", "halted"), [(6, 0, False), (7, 0, True), (4, 5, True)]
+)
+def test_where_most_pads_of_a_chip_are_stuck_none_of_it_is_valid_until_they_move(
+    stuck: int, constant: int, halted: bool
+) -> None:
+    """Those that were constant when calibrated cannot be called stuck, and do not count."""
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    alive = (np.arange(12) < 12 - constant)[None]
+
+    def sweep() -> np.ndarray:
+        return np.where(alive, noisy_bytes(rng, 0.8, centre), np.uint8(240))
+
+    liveness = Liveness(K, np.array([sweep() for _ in range(100)]).std(axis=0), PERIOD_S)
+    for _ in range(160):
+        raw = sweep()
+        raw[2, :stuck] = 239
+        liveness.step(raw, HERE, NO)
+    liveness.catch_up()
+    after = Liveness(K, np.full((K, 12), 0.8), PERIOD_S)
+    after.keep(liveness, np.ones(1, np.bool_))
+    for one in (liveness, after):
+        assert one.halted.tolist() == [False, False, halted, False]
+        assert one.stuck[2].sum() == stuck
+        assert one.doubted is not None and one.lifeless is not None
+        assert one.doubted[2].all() == halted and not one.doubted[[0, 1, 3]].any()
+        assert one.lifeless[2].all() == halted
+    # Stuck pads are left out of a calibration, which makes no other of the chip valid.
+    left_out = np.where((np.arange(12) < stuck) & (np.arange(K) == 2)[:, None], np.nan, 0.8)
+    calibrated_since = Liveness(K, np.where(alive, left_out, 0.0), PERIOD_S)
+    calibrated_since.keep(liveness, np.zeros(1, np.bool_))
+    assert calibrated_since.halted.tolist() == [False, False, halted, False]
+    for _ in range(30):
+        liveness.step(sweep(), HERE, NO)
+    liveness.catch_up()
+    assert liveness.doubted is None and not liveness.halted.any()
+
+
 def test_a_held_hand_is_given_more_time() -> None:
     """The bytes of an iCub's fingertips repeat for 19 sweeps while its hand holds something."""
     rng = np.random.default_rng(3)
@@ -312,9 +351,9 @@ def test_a_pad_is_noisy_beyond_its_noise_under_pressure_where_that_was_measured(
         if int(sweep * period_s / CONVERSION_S) != conversions:
             conversions = int(sweep * period_s / CONVERSION_S)
             raw = noisy_bytes(rng, 0.4, np.full((K, 12), 200.0))
-            if conversions % 2:
-                raw[0] -= 12
-                raw[1] -= 40
+            low = ((conversions + np.arange(12)) % 2).astype(np.uint8)
+            raw[0] -= 12 * low
+            raw[1] -= 40 * low
         liveness.step(raw, HERE, NO)
     assert not liveness.noisy[2:].any()
     assert liveness.noisy[0].tolist() == [False] * 6 + [True] * 6
@@ -1063,7 +1102,7 @@ def slow(period_s: float, pressed_units: np.ndarray | None = None) -> Liveness:
     return Liveness(K, np.full((K, 12), 0.4), period_s, pressed_units=pressed_units)
 
 
-@pytest.mark.parametrize("period_s", SLOW_PERIODS_S)
+@pytest.mark.parametrize("period_s", [0.025, 0.03, 0.04, PERIOD_S, *SLOW_PERIODS_S])
 @pytest.mark.parametrize("contact_share", [0.3, 0.5, 0.7])
 @given(hz=st.floats(0.5, 4.9), pads=st.sampled_from([3, 6, 12]), seed=st.integers(0, 99))
 @example(hz=0.734375, pads=12, seed=33)
@@ -1081,7 +1120,7 @@ def test_pads_that_a_hand_taps_are_not_noisy_however_seldom_they_are_read(
         assert not liveness.noisy.any()
 
 
-@pytest.mark.parametrize("period_s", SLOW_PERIODS_S)
+@pytest.mark.parametrize("period_s", [PERIOD_S, *SLOW_PERIODS_S])
 @pytest.mark.parametrize("jumping_pads", [1, 2])
 @pytest.mark.parametrize("seed", range(5))
 def test_few_pads_that_jump_are_noisy_for_slow_boards_too(
@@ -1095,7 +1134,7 @@ def test_few_pads_that_jump_are_noisy_for_slow_boards_too(
     assert np.argwhere(liveness.noisy).tolist() == [[0, pad] for pad in range(jumping_pads)]
 
 
-@pytest.mark.parametrize("period_s", SLOW_PERIODS_S)
+@pytest.mark.parametrize("period_s", [PERIOD_S, *SLOW_PERIODS_S])
 def test_a_temperature_pad_that_a_slow_board_takes_off_the_others_is_noisy_although_they_follow(
     period_s: float,
 ) -> None:

@@ -107,6 +107,18 @@ def test_a_pad_that_stops_is_stuck_until_it_moves_again() -> None:
     assert not watched.pads.stuck.any()
 
 
+def test_a_quiet_pad_that_sticks_is_found_at_last() -> None:
+    """What is known of it is not forgotten while it shows nothing else."""
+    plain = Repeats([Encoding(NO_GAIN, 2, NO_LOAD, False)] * K)
+    pads = StuckPads(np.full(SHAPE, 0.4), np.ones(K), np.full(K, PERIOD_S), plain, 1)
+    allowed = float(pads.longest[1, 5])
+    assert 1000 < allowed < 20_000
+    raw, changed = np.full(SHAPE, 240, np.uint8), np.zeros(SHAPE, bool)
+    for _ in range(round(1.1 * allowed)):
+        pads.step(raw, changed, None, NO)
+    assert pads.stuck[1, 5]
+
+
 def hold(watched: Watched, rng: np.random.Generator, *bytes_: int) -> list[bool]:
     """Show these bytes of the pad that stuck; return in which sweeps it is stuck."""
     found = []
@@ -368,7 +380,7 @@ def test_a_stuck_pad_is_found_though_the_noise_of_the_thermal_pad_moves_its_byte
         watched.show(sent(sweep(), GAIN, 2, False))
     assert watched.accusations == 0
     held, changes = sweep(), 0
-    for _ in range(160):
+    for _ in range(240):
         words = sweep()
         words[2, [0, 1, 9]] = held[2, [0, 1, 9]]
         before = watched.raw
@@ -376,6 +388,34 @@ def test_a_stuck_pad_is_found_though_the_noise_of_the_thermal_pad_moves_its_byte
         changes += np.count_nonzero((watched.raw != before)[2, [0, 1, 9]])
     assert changes > 30
     assert np.argwhere(watched.pads.stuck).tolist() == [[2, 0], [2, 1], [2, 9]]
+
+
+@pytest.mark.parametrize("gain", [GAIN, GAIN_V2], ids=["type 0", "type 8"])
+@pytest.mark.parametrize(("shift", "sigma"), [(2, 0.5), (3, 0.25), (3, 0.4), (4, 0.2)])
+@pytest.mark.parametrize("thermal_share", [0.5, 1.0])
+@pytest.mark.parametrize("colder", [-1.0, 1.0])
+def test_quiet_pads_that_are_compensated_are_not_accused_when_it_becomes_warmer_or_colder(
+    gain: tuple[int, ...], shift: int, sigma: float, thermal_share: float, colder: float
+) -> None:
+    """One word may explain more bytes of a pad then, and a temperature pad may come to rest in one
+    byte, so that its noise no longer moves the others against the edges of theirs.
+    """
+    rng = np.random.default_rng(3)
+    repeats = Repeats([Encoding(gain, shift, NO_LOAD, False)] * K)
+    centre = 20000 + rng.uniform(-20, 20, SHAPE)
+    others = np.delete(np.arange(12), THERMAL_TAXEL)
+    share = np.array(gain) / 128
+
+    def sweep(change: float) -> np.ndarray:
+        noise = sigma * 2**shift * rng.standard_normal(SHAPE)
+        words = centre + change * share + noise
+        words[:, THERMAL_TAXEL] = 20000 + change + thermal_share * noise[:, THERMAL_TAXEL]
+        return sent(np.rint(words), gain, shift, False)
+
+    watched = Watched(np.array([sweep(15.0 * colder) for _ in range(100)]), repeats)
+    for change in np.linspace(15.0, -15.0, 4000) * colder:
+        watched.show(sweep(change))
+        assert not watched.pads.stuck[:, others].any()
 
 
 def test_damaged_bytes_of_the_thermal_pad_show_no_life_of_those_compensated_with_it() -> None:

@@ -36,7 +36,7 @@ CODES: list[tuple[str, float | None, str]] = [
 ]
 #: Faults of what is behind a triangle: nothing it sends may be believed.
 DOUBTED = {"chip_gone", "stuck_taxel", "noisy_taxel", "shorted_finger", "wrong_address"}
-LONGEST_S = 20.0
+LONGEST_S = 60.0
 HEAD = """| fault | reported as | after, median (longest) s | not valid after, longest s |
 |---|---|---|---|"""
 STEP_S = 0.1

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from skin_host.bus.compensation import thermal_gains
 from skin_host.evaluation.simulate.world import World
 from skin_host.health.describe import enough_rest
 from skin_host.health.diagnosis import JITTER_SHARE
@@ -58,7 +59,7 @@ def longest_chance_s(world: World, board: str, triangle: int, pad: int) -> float
     small beside one unit and it rests in the middle of a byte.
 
     A calibration finds too much noise in such a pad at the edge of a byte, or too little in its
-    middle.
+    middle. Where boards compensate temperature, whole bytes may be of one word of the chip.
     """
     taxel = _taxel_of(world, board, triangle, pad)
     own_units = float(world.robot.skin.noise_ff[taxel] / world.layout.unit_ff[taxel])
@@ -66,9 +67,11 @@ def longest_chance_s(world: World, board: str, triangle: int, pad: int) -> float
     calibration = None if world.life is None else world.life.daemon.engine.calibration
     if calibration is not None:
         noise_units = min(noise_units, float(calibration.noise[taxel]))
-    rate = rate_in_run(np.array([noise_units]))
+    settings = world.settings.boards[board]
+    gains, _ = thermal_gains(settings.effective_skin_type, triangle)
+    rate = rate_in_run(np.array([noise_units]), 1.0 + math.ceil(gains[pad] / 128))
     conversions = max(float(longest_run(rate, CALIBRATED_SAMPLES, ODDS)[0]), LEAST_REPEATS)
-    period_ms = world.settings.boards[board].period_ms
+    period_ms = settings.period_ms
     return conversions * max(period_ms * 1e-3, CONVERSION_S)
 
 
