@@ -13,6 +13,7 @@ from skin_host.evaluation.simulate.promises.limits import (
     MOST_AREA,
     MOST_TILT,
     PUBLISHED,
+    TOUCHING_KPA,
     Mask,
 )
 from skin_host.evaluation.simulate.promises.truth import Floats, Truth
@@ -114,7 +115,8 @@ class ContactCheck:
     ) -> str | None:
         """Return a centroid that is a pitch away from all places that the pressures explain.
 
-        On one pad or two a template's probe explains a reading wherever it covers them.
+        On one pad or two a template's probe explains a reading wherever it covers them. What
+        presses beside them is in the readings that it explains before those pads are touched.
         """
         assert event.peak_kpa is not None
         if event.centroid_m is None:
@@ -128,9 +130,14 @@ class ContactCheck:
         taxels = np.asarray(event.taxels, np.intp)
         reach_m, chosen = 0.0, self._world.settings.parts[part.name]
         if chosen.localization != "centroid":
-            if len(ever) < LOCATED_PADS:
+            if len(event.taxels) < LOCATED_PADS:
                 reach_m = max(chosen.probe_mm) / 2e3
-            taxels, low, high = ever, np.zeros(len(ever)), np.full(len(ever), np.inf)
+            pressed = np.flatnonzero(self._truth.most_kpa(LOOKED_BACK_NS)[of_part] > TOUCHING_KPA)
+            apart_m = self._world.layout.position_m[of_part]
+            apart_m = np.linalg.norm(apart_m[pressed, None] - apart_m[None, ever], axis=2)
+            beside = pressed[apart_m.min(axis=1, initial=np.inf) < max(chosen.probe_mm) / 1e3]
+            taxels = np.union1d(ever, beside)
+            low, high = np.zeros(len(taxels)), np.full(len(taxels), np.inf)
         place_m = self._world.layout.position_m[of_part][taxels]
         mm2 = self._world.layout.area_mm2[of_part][taxels]
         pitch_m = self._pitch_m[of_part][taxels].max()
