@@ -219,13 +219,13 @@ MUTANTS = [
     Mutant(
         "contacts have no area",
         "processing/contacts/tracker.py",
-        "                area_mm2=area_mm2,\n",
+        "                area_mm2=found.area_mm2[number],\n",
         "                area_mm2=0.001,\n",
     ),
     Mutant(
         "the mean pressure is a sum in Pa",
         "processing/contacts/tracker.py",
-        "mean_kpa=totals[number] / area_mm2,",
+        "mean_kpa=mean,",
         "mean_kpa=totals[number] * 1e3,",
     ),
     Mutant(
