@@ -67,14 +67,14 @@ def record(
 
 
 def on_scheduled_buses(config: Path, scene: Scene, folder: Path) -> Path:
-    """Rewrite a configuration's buses, `[buses.NAME]` without keys, to play this scene."""
+    """Rewrite a configuration's buses, of which only the channel is given, to play this scene."""
     settings = load(config)
     layout = build_layout(settings, config.parent)
     files = record(settings, layout, scene, 6.0, 4.0, folder)
     text = config.read_text()
     for bus, file in files.items():
         keys = f'interface = "{INTERFACE}"\nchannel = "{file}"'
-        text = text.replace(f"[buses.{bus}]", f"[buses.{bus}]\n{keys}")
+        text = text.replace(f'[buses.{bus}]\nchannel = "{bus}"', f"[buses.{bus}]\n{keys}")
     config.write_text(text + "\n")
     return config
 

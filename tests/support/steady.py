@@ -27,7 +27,8 @@ def whole_skin(folder: Path) -> Path:
     lines = ['robot = "load"']
     for board in range(11):
         bus, address = divmod(board, 4)
-        lines += [f"[buses.can{bus}]"] * (address == 0)
+        if address == 0:
+            lines += [f"[buses.can{bus}]", f'channel = "can{bus}"']
         lines += [f"[boards.b{board}]", f'bus = "can{bus}"', f"address = {address + 1}"]
         lines += ["period_ms = 20", "[[parts.body.patches]]", f'board = "b{board}"']
         lines += ['triangles = "0-15"']
@@ -38,7 +39,8 @@ def four_parts(folder: Path) -> Path:
     """Four parts of 192 taxels, each of one board on a bus of its own, at 20 Hz."""
     lines = ['robot = "load"']
     for number in range(4):
-        lines += [f"[buses.can{number}]", f"[boards.b{number}]", f'bus = "can{number}"']
+        lines += [f"[buses.can{number}]", f'channel = "can{number}"']
+        lines += [f"[boards.b{number}]", f'bus = "can{number}"']
         lines += ["address = 1", "period_ms = 50"]
         lines += [f"[[parts.part{number}.patches]]", f'board = "b{number}"', 'triangles = "0-15"']
     return written(folder, lines)
