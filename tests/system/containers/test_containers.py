@@ -183,13 +183,20 @@ def test_the_page_shows_itself_and_keeps_what_it_records(
         async with connect(
             "ws://127.0.0.1:8080/live", origin=Origin("http://127.0.0.1:8080"), max_size=None
         ) as socket:
+
+            async def received(**wanted: object) -> dict[str, Any]:
+                async for data in socket:
+                    message = json.loads(data) if isinstance(data, str) else {}
+                    if wanted.items() <= message.items():
+                        return dict(message)
+                raise AssertionError("the page's server closed the connection")
+
+            # It was started with the broker, and finds it some seconds later.
+            await received(type="status", connected=True)
             for wish in ("record", "stop"):
                 await socket.send(json.dumps({"do": wish}))
-                async for data in socket:
-                    answer = json.loads(data) if isinstance(data, str) else {}
-                    if answer.get("type") == "answer":
-                        assert answer.get("ok"), answer
-                        break
+                answer = await received(type="answer")
+                assert answer["ok"], answer
 
     asyncio.run(record())
     kept = podman("exec", computer.container("daemon"), "ls", "recordings").stdout
