@@ -266,7 +266,7 @@ class Describer:
             # What pressed one of the two boards as it was zeroed cannot be known.
             return None
         # Single pads are listed with the taxels; only a whole triangle counts here.
-        far = self._far(board, sweep.raw, self._engine.zeros.in_doubt(board))[number]
+        far = self._far(board, sweep.raw)[number]
         many = np.count_nonzero(far) >= FAR_PADS
         other = lifted(sweep.raw[number], far)
         return "out of range" if many or other else None
@@ -278,7 +278,7 @@ class Describer:
         loses |= any(gained.get(lost, 0) for lost in ("dropped", "overflows"))
         return LOST_SWEEPS if loses else ABSENT_SWEEPS
 
-    def _far(self, board: int, raw: NDArray[np.uint8], doubted: Mask) -> Mask:
+    def _far(self, board: int, raw: NDArray[np.uint8]) -> Mask:
         """Return pads bool[16, 12] of a board's last sweep that are far out of range, but for those
         that are pressed, and those that what pressed as it took its zero explains, which is
         reported as `board_in_doubt`: they read far below zero pressure, not above.
@@ -286,11 +286,10 @@ class Describer:
         Args:
             board: of the layout.
             raw: uint8[16, 12], of that sweep.
-            doubted: bool[16, 12], pads of which that is so, or may be.
         """
         row = self._engine.ledger.row[board]
         far: Mask = self._engine.ledger.far[row]
-        found: Mask = far & ~(doubted & (raw == 255))
+        found: Mask = far & ~(self._engine.zeros.in_doubt(board) & (raw == 255))
         if any_of(found):
             found &= ~self._engine.intake.far_presses.pressed(row)
         return found
@@ -314,8 +313,7 @@ class Describer:
             sweep = ledger.last[row]
             if sweep is not None and ledger.flagged[row] and row not in ledger.twice:
                 answered = (ledger.error[row] == 0)[:, None]
-                unknown = self._engine.zeros.unknown(index)
-                masks["out_of_range"] = self._far(index, sweep.raw, unknown) & answered
+                masks["out_of_range"] = self._far(index, sweep.raw) & answered
             for kind, mask in masks.items():
                 found[kind][taxels[mine & mask] - layout.start] = True
         pipeline, calibration = self._engine.pipeline, self._engine.calibration
@@ -488,7 +486,7 @@ class Describer:
         of chips that do not answer, or did not when their board was zeroed: what it takes for their
         zero is none.
         """
-        of_triangles = count_of(self._engine.zeros.unknown(index))
+        of_triangles = count_of(self._engine.zeros.in_doubt(index))
         return sum(
             int(of_triangles[number])
             for number in np.flatnonzero(of_triangles).tolist()

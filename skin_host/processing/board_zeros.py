@@ -357,19 +357,13 @@ class BoardZeros:
         return found
 
     def in_doubt(self, board: int) -> NDArray[np.bool_]:
-        """Return taxels bool[16, 12] of a board whose zero is unknown, or may be: they read far
-        below zero, which noise and wrong bits do, too, for some sweeps.
-        """
-        found = self.unknown(board)
+        """Return taxels bool[16, 12] of a board whose zero is unknown."""
+        found = np.zeros((TRIANGLES, PADS), np.bool_)
+        if board in self.rezeros:
+            found |= self.rezeros[board].unknown.reshape(TRIANGLES, PADS)
         if board in self._wrong.below:
             found |= self._wrong.below[board] > 0
         return found
-
-    def unknown(self, board: int) -> Mask:
-        """Return taxels bool[16, 12] of a board whose zero is known to be unknown."""
-        if board not in self.rezeros:
-            return np.zeros((TRIANGLES, PADS), np.bool_)
-        return self.rezeros[board].unknown.reshape(TRIANGLES, PADS)
 
     def unclear(self, board: int) -> Mask | None:
         """Return taxels bool[n] of which a calibration takes nothing that a board has sent until

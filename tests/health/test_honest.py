@@ -302,16 +302,6 @@ def test_a_chip_that_does_not_answer_is_no_touch_when_its_board_was_zeroed() -> 
     assert "board_in_doubt" not in {code for code, _ in bench.first_told}
 
 
-def test_pads_that_wrong_bits_bring_far_below_zero_are_out_of_range_not_zeroed_under_a_touch() -> (
-    None
-):
-    """What lifts stays there for some sweeps."""
-    bench = bench_of("mtb4", "signal", touched=False)
-    bench.inject("slow_rise", board="one", triangle=3)
-    bench.run(0.1)
-    assert set(bench.told) == {("taxel_out_of_range", "skin")}
-
-
 def test_a_triangle_of_a_bus_that_loses_frames_is_missing_where_chance_does_not_explain_it() -> (
     None
 ):
