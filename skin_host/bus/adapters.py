@@ -163,8 +163,9 @@ class AdapterPort(Port):
             self._look_for_device()
         else:
             try:
+                line = self._line_of_bytes()
                 for _ in range(CAPACITY):
-                    waits = self._waits()
+                    waits = None if line is None else _waits(line)
                     message = None if waits is False else self._receive(self._bus)
                     if message is None and waits:
                         continue  # an acknowledgement, noise, or the begin of a frame
@@ -174,8 +175,8 @@ class AdapterPort(Port):
                     if self._put(n, message):
                         errors |= bool(message.is_error_frame)
                         n += 1
-                line = getattr(self._bus, "_buffer", None)
-                if isinstance(line, bytearray) and len(line) > LONGEST_LINE:
+                unread = getattr(self._bus, "_buffer", None)
+                if isinstance(unread, bytearray) and len(unread) > LONGEST_LINE:
                     raise BusError("what it sends is no line of an adapter")
             except (can.CanError, OSError, BusError) as error:
                 self._note_failure(error)
@@ -278,21 +279,16 @@ class AdapterPort(Port):
             self._unreadable = 0
         return message
 
-    def _waits(self) -> bool | None:
-        """Return whether a byte waits to be read; None where that is not known, and does not count.
-
-        Raises:
-            BusError, can.CanError, OSError: the adapter is gone. Not each library shows that.
+    def _line_of_bytes(self) -> "select.poll | None":
+        """Return what shows whether a byte of a serial line waits; None of other adapters, and
+        where that is not known.
         """
         descriptor = self.fileno() if self._settings.interface in OF_BYTES else None
         if descriptor is None or descriptor < 0:
             return None
         line = select.poll()
         line.register(descriptor, select.POLLIN)
-        events = sum(event for _, event in line.poll(0))
-        if events & (select.POLLHUP | select.POLLERR):
-            raise BusError("it was unplugged")
-        return events != 0
+        return line
 
     def _wanted(self, message: can.Message) -> bool:
         # python-can's own filters are not used: with a filter, `recv(0)` returns None for a frame
@@ -373,6 +369,18 @@ def _is_failure(error: Exception) -> bool:
     if code is None and isinstance(error.__cause__, OSError):
         code = error.__cause__.errno
     return isinstance(error, ConnectionError) or code not in NO_ROOM
+
+
+def _waits(line: "select.poll") -> bool:
+    """Return whether a byte of a line waits to be read.
+
+    Raises:
+        BusError: the adapter is gone. Not each library shows that.
+    """
+    events = sum(event for _, event in line.poll(0))
+    if events & (select.POLLHUP | select.POLLERR):
+        raise BusError("it was unplugged")
+    return events != 0
 
 
 def no_answer(name: str, settings: Bus) -> BusError:

@@ -228,24 +228,18 @@ class Viewer:
             text = b"not served under this name; `skin view --name NAME` allows one\n"
             return _response(HTTPStatus.FORBIDDEN, "text/plain", text)
         path = request.path.partition("?")[0]
+        if path == "/live" and origin not in (f"http://{host}", f"https://{host}"):
+            return _response(HTTPStatus.FORBIDDEN, "text/plain", b"not from our own page\n")
+        # The page too: a browser does not show why a WebSocket is refused.
+        if path in ("/", "/live") and self._pages >= MAX_PAGES:
+            why = f"{MAX_PAGES} pages are open already; close one, and load this one again\n"
+            return _response(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", why.encode())
         if path == "/live":
-            if origin not in (f"http://{host}", f"https://{host}"):
-                return _response(HTTPStatus.FORBIDDEN, "text/plain", b"not from our own page\n")
-            return self._refuse_more()
-        # A browser does not show why a WebSocket is refused.
-        if path == "/" and (refusal := self._refuse_more()) is not None:
-            return refusal
+            return None
         file = self._files.get("index.html" if path == "/" else path.removeprefix("/"))
         if file is None:
             return _response(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
         return _response(HTTPStatus.OK, *file)
-
-    def _refuse_more(self) -> Response | None:
-        """Return the refusal of a page, or its WebSocket, while as many are open as may be."""
-        if self._pages < MAX_PAGES:
-            return None
-        text = f"{MAX_PAGES} pages are open already; close one, and load this one again\n"
-        return _response(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", text.encode())
 
     async def _talk(self, page: ServerConnection) -> None:
         """Send one page its new messages until it closes, and take its requests."""

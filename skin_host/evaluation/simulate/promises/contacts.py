@@ -127,18 +127,17 @@ class ContactCheck:
                 return None
             low, high = np.zeros_like(low), np.full_like(high, np.inf)
         of_part = slice(part.start, part.stop)
-        taxels = np.asarray(event.taxels, np.intp)
+        taxels, place_m = np.asarray(event.taxels, np.intp), self._world.layout.position_m[of_part]
         reach_m, chosen = 0.0, self._world.settings.parts[part.name]
         if chosen.localization != "centroid":
             if len(event.taxels) < LOCATED_PADS:
                 reach_m = max(chosen.probe_mm) / 2e3
             pressed = np.flatnonzero(self._truth.most_kpa(LOOKED_BACK_NS)[of_part] > TOUCHING_KPA)
-            apart_m = self._world.layout.position_m[of_part]
-            apart_m = np.linalg.norm(apart_m[pressed, None] - apart_m[None, ever], axis=2)
+            apart_m = np.linalg.norm(place_m[pressed, None] - place_m[None, ever], axis=2)
             beside = pressed[apart_m.min(axis=1, initial=np.inf) < max(chosen.probe_mm) / 1e3]
             taxels = np.union1d(ever, beside)
             low, high = np.zeros(len(taxels)), np.full(len(taxels), np.inf)
-        place_m = self._world.layout.position_m[of_part][taxels]
+        place_m = place_m[taxels]
         mm2 = self._world.layout.area_mm2[of_part][taxels]
         pitch_m = self._pitch_m[of_part][taxels].max()
         if np.isfinite(high).all():
