@@ -34,7 +34,7 @@ from skin_host.processing.rezero import (
     repeats_of,
 )
 from skin_host.processing.silent_zero import STILL_SHARE, SilentZero
-from skin_host.processing.wrong_zeros import WrongZeros
+from skin_host.processing.wrong_zeros import WrongZeros, others_rest
 
 
 class BoardZeros:
@@ -157,7 +157,7 @@ class BoardZeros:
         if row in ledger.twice:
             self._note_twice(sweep, row)
             return
-        if ledger.flagged[row] or self._wrong.below:
+        if ledger.flagged[row] or self._wrong.follows:
             self._note_below_zero(sweep, row)
         if self._wrong.may_be_at_end(sweep):
             self._note_at_end(sweep, row)
@@ -673,7 +673,10 @@ class BoardZeros:
             return
         ledger, rezero = self._ledger, self.rezeros.get(sweep.board)
         answered = ledger.answered(row)
-        below = below_zero(sweep.raw, ledger.far[row] & answered[:, None])
+        far = ledger.far[row] & answered[:, None]
+        below, same = below_zero(sweep.raw, far), self._of_same_chip(sweep, row, far)
+        if same is not None:
+            below |= same[:, None] & far & (sweep.raw == END)
         pressed, is_new = np.zeros_like(below), False
         if rezero is not None:
             pressed = rezero.unknown.reshape(TRIANGLES, PADS)
@@ -682,6 +685,36 @@ class BoardZeros:
         received = answered, ledger.present[row]
         wrong = self._wrong.note_below(sweep, below, received, pressed, no_load, is_new=is_new)
         self._doubt_pads(sweep, wrong)
+        if same is not None and any_of(wrong & same[:, None]):
+            explained = self._intake.zeroed_pressed.get(row, np.zeros_like(wrong))
+            self._intake.zeroed_pressed[row] = explained | (wrong & same[:, None])
+
+    def _of_same_chip(self, sweep: Sweep, row: int, far: Mask) -> Mask | None:
+        """Return the triangles bool[16] of which pads read far below zero, as another chip's would,
+        and the others have shown that they are not; None if there are none.
+
+        Args:
+            sweep: of a board.
+            row: of that.
+            far: bool[16, 12], its pads that are far out of range.
+        """
+        pipeline, calibration = self._pipeline, self._calibration
+        if pipeline is None or calibration is None or row in self._ledger.twice:
+            return None
+        resting = self._intake.reads_another(row, sweep.raw)
+        if any_of(resting):
+            taxels = self._of(sweep.board)
+            no_load = float(self._layout.boards[sweep.board].settings.no_load)
+            known = (taxels >= 0) & calibration.usable[taxels] & ~self.in_doubt(sweep.board)
+            resting &= others_rest(
+                no_load - sweep.raw - pipeline.baseline[taxels],
+                pipeline.enter[taxels],
+                far,
+                known,
+                self._layout.pad_kind[taxels] == PadKind.PRESSURE,
+            )
+        same = self._wrong.note_resting(sweep.board, resting, self._ledger.present[row])
+        return same if any_of(same) else None
 
     def _note_at_end(self, sweep: Sweep, row: int) -> None:
         """Doubt pads that rest at the end of the scale, or beyond it."""

@@ -3,6 +3,10 @@
 A zero that was taken under a press is that of the pressed pad. When the press lifts, the pad reads
 far below zero, which its board marks, or rests at the end of the scale, or beyond it. There nobody
 knows where it rests, so that a press is felt late and measured too low.
+
+Several pads of a chip that read far below zero may be those of another chip, see `intake.lifted`.
+Where the others of their triangle rest where they did, and none reads more, they are not: the
+baselines of two chips differ by far more than noise.
 """
 
 import numpy as np
@@ -12,15 +16,18 @@ from skin_host.bus.assembler import Sweep
 from skin_host.bus.wire import TRIANGLES
 from skin_host.processing.drift import SETTLE_S
 from skin_host.processing.liveness import PADS
-from skin_host.processing.masks import Mask, any_of
+from skin_host.processing.masks import Mask, any_of, count_of
 from skin_host.processing.rezero import BELOW_SWEEPS, END, JUMPS_NS
 
 #: One reading inside the scale counts as so many at its end: a pad whose noise reaches inside in a
 #: tenth of its readings rests within 1.3 standard deviations of the end.
 INSIDE_WEIGHT = 9
+#: So many pads of a triangle that rest where they did are those of the same chip.
+RESTING_PADS = 2
 #: The byte at the end of the scale, to be found among those of a sweep.
 _END_BYTE = bytes((END,))
 _NO_SWEEPS = np.zeros((TRIANGLES, PADS), np.int64)
+_NO_TRIANGLES = np.zeros(TRIANGLES, np.int64)
 
 Sweeps = NDArray[np.int64]
 
@@ -35,6 +42,8 @@ class WrongZeros:
 
     def __init__(self) -> None:
         self.below: dict[int, Sweeps] = {}
+        #: By board in how many sweeps in a row the others of each triangle, int64[16], have rested.
+        self._others_rest: dict[int, Sweeps] = {}
         #: By board, of how many sweeps more each pad has sent the end of the scale than readings
         #: inside, these by `INSIDE_WEIGHT`, where any have.
         self._at_end: dict[int, Sweeps] = {}
@@ -44,11 +53,17 @@ class WrongZeros:
     def go_on(self, before: "WrongZeros") -> None:
         """Take over the state of a predecessor for the same boards."""
         self.below, self._at_end = before.below, before._at_end
+        self._others_rest = before._others_rest
         self._jumped_ns = before._jumped_ns
 
     def forget(self, board: int) -> None:
         """A board has a new zero: what rested at the end of its scale may do so no more."""
         self._at_end.pop(board, None)
+
+    @property
+    def follows(self) -> bool:
+        """Return whether `note_below` and `note_resting` have anything to do with any sweep."""
+        return bool(self.below or self._others_rest)
 
     def may_be_at_end(self, sweep: Sweep) -> bool:
         """Return whether `note_at_end` has anything to do with a sweep."""
@@ -93,6 +108,22 @@ class WrongZeros:
         wrong: Mask = lasted >= BELOW_SWEEPS
         return wrong
 
+    def note_resting(self, board: int, resting: Mask, present: Mask) -> Mask:
+        """Return the triangles bool[16] of a board that are of the same chip as before, though pads
+        of them read far below zero.
+
+        Args:
+            board: its index.
+            resting: bool[16], those whose other pads rest in a sweep, see `others_rest`.
+            present: bool[16], those that were received in it.
+        """
+        before = self._others_rest.pop(board, _NO_TRIANGLES)
+        lasted = np.where(present, (before + 1) * resting, before)
+        if any_of(lasted > 0):
+            self._others_rest[board] = lasted
+        same: Mask = lasted >= BELOW_SWEEPS
+        return same
+
     def note_at_end(self, sweep: Sweep, pads: Mask, period_s: float, *, touching: bool) -> Mask:
         """Return pads bool[16, 12] that rest at the end of the scale, or beyond it.
 
@@ -115,3 +146,28 @@ class WrongZeros:
             self._at_end[sweep.board] = lasted
         wrong: Mask = lasted * period_s >= SETTLE_S
         return wrong
+
+
+def others_rest(
+    above_units: NDArray[np.float64],
+    enter_units: NDArray[np.float64],
+    far: Mask,
+    known: Mask,
+    pressure: Mask,
+) -> Mask:
+    """Return the triangles bool[16] of which pads read far below zero, and the others show that it
+    is not another chip that reads so.
+
+    Args:
+        above_units: float64[16, 12], what each pad reads above its baseline.
+        enter_units: float64[16, 12], from where on that is a touch.
+        far: bool[16, 12], pads that their status words mark as far out of range.
+        known: bool[16, 12], those whose baseline is known.
+        pressure: bool[16, 12], those that measure pressure.
+    """
+    resting = known & ~far & (np.abs(above_units) < enter_units)
+    # What lifts brings no pad above where it rests. One that warms up may be.
+    raised = known & pressure & (above_units >= enter_units)
+    below = far & (above_units < 0.0)
+    found: Mask = (count_of(below) > 0) & (count_of(raised | (far & ~below)) == 0)
+    return found & (count_of(resting) >= RESTING_PADS)

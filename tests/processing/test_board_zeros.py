@@ -172,15 +172,45 @@ def test_pads_that_lift_after_a_zero_under_a_press_show_no_other_chip(hand: Hand
     assert np.flatnonzero(~frames[-1].valid[:12]).tolist() == [1, 2, 3, 4, 5]
 
 
-def test_pads_that_lift_and_were_not_pressed_when_their_board_was_zeroed_are_of_another_chip(
-    hand: Hand,
+@pytest.mark.parametrize("below", [3, 9])
+def test_pads_that_lift_after_a_press_that_nobody_knew_of_show_no_other_chip(
+    hand: Hand, below: int
 ) -> None:
+    """The pads that rest where they did are those of the same chip, and stay valid."""
     frames: list[PressureFrame] = []
     hand.deliver = lambda output: frames.extend(output.frames)
-    hand.send(40, p1=200)
+    hand.send(40)
     hand.engine.zeros.rezero(0)
     hand.send(60)
-    hand.send(10, p1=FAR_BELOW, p2=FAR_BELOW, p3=FAR_BELOW)
+    lifted = {f"p{pad}": FAR_BELOW for pad in range(below)}
+    hand.send(10, **lifted)
+    assert hand.in_doubt == list(range(below))
+    hand.send(60, **lifted)
+    assert np.flatnonzero(frames[-1].valid[:12]).tolist() == list(range(below, 12))
+    # What presses one of them again is in doubt, too.
+    hand.send(20, **(lifted | {"p2": 200}))
+    assert np.flatnonzero(frames[-1].valid[:12]).tolist() == list(range(below, 12))
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        dict.fromkeys(range(2, 11), 254),
+        dict.fromkeys(range(2, 11), 254) | {11: 20},
+        {11: 20},
+        {11: 0},
+    ],
+)
+def test_pads_far_below_zero_are_of_another_chip_where_others_do_not_rest(
+    hand: Hand, others: dict[int, int]
+) -> None:
+    """Fewer than two rest where they did, or one reads what lifting nothing brings it to."""
+    frames: list[PressureFrame] = []
+    hand.deliver = lambda output: frames.extend(output.frames)
+    hand.send(40)
+    hand.engine.zeros.rezero(0)
+    hand.send(60)
+    hand.send(10, p0=FAR_BELOW, p1=FAR_BELOW, **{f"p{pad}": raw for pad, raw in others.items()})
     assert not frames[-1].valid[:12].any()
 
 

@@ -128,3 +128,16 @@ def test_a_new_zero_ends_what_was_counted_at_the_end_of_the_scale():
     at_end(zeros, 0)
     zeros.forget(0)
     assert not zeros.may_be_at_end(sweep(1))
+
+
+def test_a_triangle_is_of_the_same_chip_once_its_others_have_rested_in_sweeps_in_a_row():
+    zeros, here = WrongZeros(), ALL.copy()
+    here[2] = False
+    for _ in range(BELOW_SWEEPS - 1):
+        assert not zeros.note_resting(0, ALL, ALL).any()
+    # What was not received counts neither way, and what rests no more begins again.
+    assert zeros.note_resting(0, ALL & here, here).sum() == TRIANGLES - 1
+    assert zeros.note_resting(0, ALL, ALL).all()
+    assert zeros.follows
+    assert not zeros.note_resting(0, ~ALL, ALL).any()
+    assert not zeros.follows

@@ -9,6 +9,7 @@ from skin_host.evaluation.simulate.promises.limits import (
     FAINT_KPA,
     LEAST_AREA,
     LOCATED_PADS,
+    LOCATED_SIGMAS,
     LOOKED_BACK_NS,
     MOST_AREA,
     MOST_TILT,
@@ -115,8 +116,9 @@ class ContactCheck:
     ) -> str | None:
         """Return a centroid that is a pitch away from all places that the pressures explain.
 
-        On one pad or two a template's probe explains a reading wherever it covers them. What
-        presses beside them is in the readings that it explains before those pads are touched.
+        On one pad or two a template's probe explains a reading wherever it covers them, and what
+        noise has left of a press is explained by many places: it reports how many. What presses
+        beside the pads is in the readings that it explains before those pads are touched.
         """
         assert event.peak_kpa is not None
         if event.centroid_m is None:
@@ -130,8 +132,9 @@ class ContactCheck:
         taxels, place_m = np.asarray(event.taxels, np.intp), self._world.layout.position_m[of_part]
         reach_m, chosen = 0.0, self._world.settings.parts[part.name]
         if chosen.localization != "centroid":
+            reach_m = LOCATED_SIGMAS * (event.sigma_m or 0.0)
             if len(event.taxels) < LOCATED_PADS:
-                reach_m = max(chosen.probe_mm) / 2e3
+                reach_m = max(reach_m, max(chosen.probe_mm) / 2e3)
             pressed = np.flatnonzero(self._truth.most_kpa(LOOKED_BACK_NS)[of_part] > TOUCHING_KPA)
             apart_m = np.linalg.norm(place_m[pressed, None] - place_m[None, ever], axis=2)
             beside = pressed[apart_m.min(axis=1, initial=np.inf) < max(chosen.probe_mm) / 1e3]

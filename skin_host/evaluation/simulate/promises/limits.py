@@ -49,6 +49,8 @@ LEAST_AREA, MOST_AREA, MOST_TILT = 0.9, 3.0, np.deg2rad(10.0)
 FAINT_KPA = 2.0
 #: By fewer pads a probe cannot be located in the plane.
 LOCATED_PADS = 3
+#: What a template has located is no further off than so many of its own standard errors.
+LOCATED_SIGMAS = 3.0
 #: Numbers of events are rounded.
 PUBLISHED = 1e-3
 #: Pads that press at least so much are pressed firmly.
