@@ -71,7 +71,11 @@ _TRIANGLE_SENTENCES = {
     "frozen": "repeats the bytes of most pads, or of all, for longer than chance allows: its chip "
     "has stopped, or lost its set-up: switch the board off and on, then calibrate",
     "constant": "did not change during the calibration and has not changed since",
-    "out of range": "reads far outside its range on all pads",
+    "out of range": (
+        "reads far out of its range: if it was pressed when its board was zeroed, set the board up "
+        "again while nothing touches it: skin command configure --board {board}; if not, its chip "
+        "has another address, or its data line another plug"
+    ),
 }
 _TAXEL_FAULTS = {
     "stuck": "the same byte for too long in a triangle that otherwise works; not valid",
