@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from skin_host.bus.ledger import INTERVALS, STALE_INTERVALS_NS, Allowance, is_period, regular_ns
+from skin_host.bus.ledger import STALE_INTERVALS_NS, Allowance, is_period, regular_ns
 from skin_host.bus.strain import (
     CHANNELS,
     LOADS,
@@ -37,6 +37,9 @@ Floats = NDArray[np.float64]
 
 _COMMAND = int(MessageClass.ANALOG_COMMAND)
 
+#: A board's period is known by so many intervals. Of one that loses a third of its frames, 16 in a
+#: row look regular and twice as long every 2000th time, and 48 do once in weeks.
+PERIOD_INTERVALS = 48
 #: A zero is the mean of at least this many samples.
 FEWEST_SAMPLES = 10
 #: A sample is compared with the median of so many, itself in the middle: a load lasts for longer.
@@ -102,7 +105,7 @@ class TipState:
     silenced: int = 0
     alive: bool = False
     incomplete: bool = False
-    intervals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=INTERVALS))
+    intervals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=PERIOD_INTERVALS))
     came: bool = False
     sampled: bool = False
     awaited: bool = False
@@ -124,7 +127,9 @@ class TipState:
 
         By few intervals, one that loses half of its samples might seem regular.
         """
-        return regular_ns(list(self.intervals_ns)) if len(self.intervals_ns) == INTERVALS else None
+        if len(self.intervals_ns) < PERIOD_INTERVALS:
+            return None
+        return regular_ns(list(self.intervals_ns))
 
     @property
     def keeps_period(self) -> bool | None:

@@ -185,7 +185,7 @@ async def test_a_board_that_sends_in_another_period_is_named_and_set_up_again(
     bench.robot.receive("can0", *command_frame(SetTransmissionPeriod(period_ms), 1))
     bench.sent.clear()
     sentences: set[str] = set()
-    for _ in range(20):
+    for _ in range(30):
         await bench.run(0.02)
         sentences.update(bench.record()["sentences"])
         assert bench.codes("thumb") == []
@@ -323,6 +323,25 @@ def test_samples_that_are_late_or_lost_are_not_of_another_period(
         torque = encode_strain(1, StrainType.TORQUE, [0, 0, number])
         batch = FrameBatch.of([(*force, t_ns), (*torque, t_ns + 130_000)])
         bench.engine.feed("can0", batch)
+        assert state.keeps_period is not False
+
+
+def test_a_board_that_loses_a_third_of_its_frames_is_not_of_another_period() -> None:
+    """Every few minutes it was called one that sends in twice its period, and set up again."""
+    bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
+    state = bench.tips.tips["index"]
+    rng = np.random.default_rng(3)
+    for turn in range(10_000):
+        frames = [
+            (
+                *encode_strain(1, kind, [0, 0, sample % 1000]),
+                10**18 + 3_000_000 * sample + 130_000 * later,
+            )
+            for sample in range(6 * turn, 6 * turn + 6)
+            for later, kind in enumerate((StrainType.FORCE, StrainType.TORQUE))
+            if rng.random() > 0.33
+        ]
+        bench.engine.feed("can0", FrameBatch.of(frames))
         assert state.keeps_period is not False
 
 
