@@ -82,7 +82,7 @@ class Zeros(Struct, forbid_unknown_fields=True):
         stuck: numbers of taxels by part whose pads are stuck. They take as long to be found again
             as the first time.
         baselines: by part, activation of each untouched taxel in units, as found after the last
-            set-up, or as it had drifted by the end. Empty: the calibration's.
+            set-up, or as it has drifted since. Empty: the calibration's.
         written: when that was so, ISO 8601 in UTC.
         robot: whose they are; empty, as in files of older versions: of whoever finds them.
         parts: names of the parts and fingertips that the node had; None in files of older versions.

@@ -3,8 +3,13 @@
 import numpy as np
 
 from skin_host.daemon.state import Zeros, baselines_of, taxels_of
+from skin_host.layout import PadKind
 from skin_host.processing.core import Engine
 from skin_host.processing.masks import Mask
+
+#: Baselines are kept again once most pads of a part have drifted by so many units: by more, noise
+#: would touch pads at the start after a crash, until their boards are set up.
+DRIFTED_UNITS = 0.5
 
 
 def go_on_from(zeros: Zeros, engine: Engine) -> Mask:
@@ -60,7 +65,8 @@ def zeros_of(
         return {name: mine for name, mine in by_part.items() if mine}
 
     baselines = before.baselines
-    if ends or found or replaced or (baselines and before.calibration != calibration.id):
+    is_other = before.calibration != calibration.id
+    if ends or found or replaced or (baselines and is_other) or _have_drifted(engine, before):
         baselines = {
             part.name: np.round(pipeline.baseline[part.start : part.stop], 2).tolist()
             for part in parts
@@ -75,4 +81,24 @@ def zeros_of(
         written=before.written,
         robot=before.robot,
         parts=before.parts,
+    )
+
+
+def _have_drifted(engine: Engine, before: Zeros) -> bool:
+    """Return whether most pads of a part rest elsewhere than a start would believe by what is kept
+    of the calibration in use.
+    """
+    calibration, pipeline, layout = engine.calibration, engine.pipeline, engine.layout
+    assert calibration is not None
+    assert pipeline is not None
+    kept_units = calibration.baseline.copy()
+    for part, baselines in baselines_of(layout, before.baselines):
+        kept_units[part.start : part.stop] = baselines
+    pads = calibration.usable & (layout.pad_kind == PadKind.PRESSURE)
+    moved_units = np.abs(pipeline.baseline - kept_units)
+    return any(
+        bool(np.median(moved_units[mine][pads[mine]]) >= DRIFTED_UNITS)
+        for part in engine.parts
+        for mine in (slice(layout.parts[part].start, layout.parts[part].stop),)
+        if pads[mine].any()
     )

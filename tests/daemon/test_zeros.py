@@ -57,11 +57,16 @@ def test_the_baselines_of_another_calibration_are_not_kept(
     engine = new_engine(calibrated)
     pipeline = engine.pipeline
     assert pipeline is not None
+    near = {
+        part.name: (pipeline.baseline[part.start : part.stop] + 0.25).tolist()
+        for part in engine.layout.parts
+    }
+    kept = msgspec.structs.replace(kept, baselines=near)
     other = msgspec.structs.replace(kept, calibration="another")
     nothing = np.zeros(engine.layout.n_taxels, np.bool_)
     for before, is_new in ((kept, False), (other, True)):
         found = zeros_of(engine, before, nothing)
-        wanted = np.round(pipeline.baseline, 2) if is_new else np.full(len(nothing), 1.25)
+        wanted = np.round(pipeline.baseline, 2) if is_new else pipeline.baseline + 0.25
         assert np.concatenate([found.baselines[one.name] for one in engine.layout.parts]) == (
             pytest.approx(wanted)
         )
@@ -78,3 +83,23 @@ def test_until_its_file_is_written_the_doubts_by_the_calibration_before_stay(
     found = zeros_of(engine, Zeros(), nothing, replaced="before", doubted=doubted)
     assert found.are_of("before")
     assert found.unknown == {"left_hand": [5]}
+
+
+@pytest.mark.parametrize(("pads", "is_kept"), [(3, False), (60, True)])
+def test_what_most_pads_of_a_part_have_drifted_by_is_kept_for_a_start_after_a_crash(
+    calibrated: FaultBench, pads: int, is_kept: bool
+) -> None:
+    """Baselines were kept at the end alone: after a crash noise touched pads that had warmed up."""
+    engine, part = new_engine(calibrated), calibrated.engine.layout.parts[0]
+    assert engine.pipeline is not None
+    nothing = np.zeros(engine.layout.n_taxels, np.bool_)
+    assert zeros_of(engine, Zeros(), nothing).baselines == {}
+    taxels = np.arange(part.start, part.start + pads, dtype=np.int32)
+    drifted = engine.pipeline.baseline[taxels] + 0.75
+    engine.pipeline.set_zero(taxels, drifted)
+    kept = zeros_of(engine, Zeros(), nothing)
+    assert bool(kept.baselines) is is_kept
+    if is_kept:
+        assert kept.baselines[part.name][:pads] == pytest.approx(drifted, abs=0.01)
+        # It is written once.
+        assert zeros_of(engine, kept, nothing) == kept
