@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import fcntl
+import itertools
 import logging
 import math
 import os
@@ -264,6 +265,7 @@ def _newer(path: Path, what: str, why: str) -> NewerFileError:
 
 def give_second_name(path: Path, word: str) -> Path | None:
     """Give a file the name `NAME.WORD-TIME`, too, under which its content outlives its replacement.
+    A file that has this name already keeps it.
 
     One that this user may not read loses its first name by that: it cannot be copied, and the
     system links only one's own.
@@ -280,7 +282,7 @@ def give_second_name(path: Path, word: str) -> Path | None:
     from skin_host.clock import SYSTEM
 
     mark = f"{path.name}.{word}-"
-    second = path.with_name(f"{mark}{SYSTEM.today():%Y%m%dT%H%M%SZ}")
+    second = _unused(path.with_name(f"{mark}{SYSTEM.today():%Y%m%dT%H%M%SZ}"))
     if not os.access(path, os.R_OK):
         path.rename(second)
         return second
@@ -293,6 +295,16 @@ def give_second_name(path: Path, word: str) -> Path | None:
     except OSError:  # a kind of disk without links
         _replace(second, read_whole(path))
     return second
+
+
+def _unused(path: Path) -> Path:
+    """Return a name that no file has: this one, or with a number. Computers without a clock of
+    their own live through the same second at each start.
+    """
+    names = itertools.chain(
+        [path], (path.with_name(f"{path.name}-{n}") for n in itertools.count(2))
+    )
+    return next(name for name in names if not os.path.lexists(name))
 
 
 def set_aside(path: Path) -> None:

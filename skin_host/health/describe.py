@@ -23,8 +23,7 @@ from skin_host.health.record import (
 )
 from skin_host.health.watch import Watch
 from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
-from skin_host.processing.calibration import Calibration, Verdict
-from skin_host.processing.calibration.calibrator import USUAL_SHIFT
+from skin_host.processing.calibration import USUAL_SHIFT, Calibration, Verdict
 from skin_host.processing.core import Engine
 from skin_host.processing.far_presses import FAR_PADS
 from skin_host.processing.intake import lifted
@@ -94,6 +93,7 @@ class Describer:
         shifts = np.array([triangle.shift for triangle in self._layout.triangles])
         #: One unit of each taxel [n], in units of the usual shift.
         self._unit = np.exp2(shifts - USUAL_SHIFT)[self._layout.triangle_of]
+        self._fineness = np.fmax(1.0 / self._unit, 1.0)
         #: For each part its baselines at the last looks, their times, and which zeros they are of.
         self._baselines: dict[int, deque[tuple[int, int, Calibration, NDArray[np.float64]]]] = {}
         #: Since when triangles, by board and number, have not changed after a calibration in which
@@ -320,7 +320,7 @@ class Describer:
         if pipeline is not None and calibration is not None:
             span = slice(layout.start, layout.stop)
             moved = np.abs(pipeline.baseline[span] - calibration.baseline[span])
-            limit = self._engine.settings.processing.drift.limit_units
+            limit = self._engine.settings.processing.drift.limit_units * self._fineness[span]
             found["returned"] = pipeline.returned(part)
             found["drifting"] = (moved > DRIFTING_SHARE * limit) & calibration.usable[span]
         # A temperature pad that fails spoils the correction of its triangle. Out of its range it is

@@ -138,6 +138,8 @@ class BaselineTracker:
         triangle: int[n], the triangle of each taxel, any numbering.
         thermal: bool[n], pads that measure temperature.
         settings: the rule and its numbers.
+        fineness: how many of the units of each taxel, a number or [n], are a usual one. Drift,
+            noise and bulges are as many times as large in them: all is judged in usual units.
 
     Attributes:
         calibrated: float64[n], the baselines before any drift.
@@ -156,9 +158,13 @@ class BaselineTracker:
         triangle: NDArray[np.int32],
         thermal: Mask,
         settings: Drift,
+        fineness: Array | float = 1.0,
     ) -> None:
         n = len(baseline)
+        self.fineness = fineness
         self.baseline = baseline
+        #: The baselines in usual units, while they are moved.
+        self._zero: Array = baseline / fineness
         self.calibrated = baseline.copy()
         self.shared_units: Array | float = 0.0
         self.owed_units: Array | float = 0.0
@@ -235,21 +241,24 @@ class BaselineTracker:
         recovering = free & of_late
         pressed = np.count_nonzero(touched | (of_late & self._usable))
         self.is_released = bool(2 * np.count_nonzero(recovering) > pressed)
-        forecast = None
+        fine, forecast = self.fineness, None
+        self._zero = self.baseline / fine
         if self._thermal is not None:
-            forecast = self._thermal.step(units, self.baseline, free, missing, dt_s)
+            forecast = self._thermal.step(units, self.baseline, free, missing, dt_s) / fine
+        units, relaxed_units = units / fine, relaxed_units / fine
+        if forecast is not None:
             units = units - forecast
             self._note_drift(forecast)
 
         received = self._usable & ~missing
         shows = free & ~recovering
-        low, noise = (units, 0.0) if lowest is None else lowest
+        low, noise = (units, 0.0) if lowest is None else (lowest[0] / fine, lowest[1] / fine)
         low = low + relaxed_units
         lifted = self._loads.lifted(low, noise, touched, received, dt_s)
         share = _share(conversions)
         share = np.where(shows | missing, share, 1.0)
         common = self._common(units, shows, int(np.count_nonzero(received)), share, dt_s)
-        self.shared_units = common if forecast is None else common + forecast
+        self.shared_units = (common if forecast is None else common + forecast) * fine
         if lifted is None and self._is_calm(units, common, hidden, dt_s):
             rate = self._settings.rate_units_per_s * dt_s
             change = self._own(units - common, rate, rate, dt_s)
@@ -264,23 +273,24 @@ class BaselineTracker:
         change[fallen] = units[fallen]
         if lifted is not None:
             fallen = fallen | lifted
-        self._loads.expect_back(fallen if common > FALLEN_UNITS else free | fallen, self.baseline)
+        self._loads.expect_back(fallen if common > FALLEN_UNITS else free | fallen, self._zero)
         if abs(common) <= QUICK_UNITS_PER_S * dt_s:
             self._note_drift(common)
 
-        level = self.baseline + units + relaxed_units
+        level = self._zero + units + relaxed_units
         still = (np.abs(level - self._last) < TOLERANCE_UNITS) & ~missing
         self._last = level
         shown = bool(np.count_nonzero(free) >= REFERENCES)
         change += self._touches.step(units, touched, dt_s, relaxed_units, shown)
-        released = still & self._touches.released(units, touched, relaxed_units, self.owed_units)
+        owed_units = self.owed_units / fine
+        released = still & self._touches.released(units, touched, relaxed_units, owed_units)
         change[released] = units[released]
         ended = recovering & (self._free_s <= dt_s) & (self._taken_s <= 0.0)
         self._by_itself = (self._by_itself | ended) & ~released
         change += self._given_back(units, level, touched, released | ended, dt_s)
         if lifted is not None:
             change[lifted] = low[lifted]
-        self._loads.note_returns(level, self.baseline, still, missing, dt_s)
+        self._loads.note_returns(level, self._zero, still, missing, dt_s)
         self._move(change, common, forecast)
         self._unsettled = self._touches.fading or bool(
             np.count_nonzero(self._fallen_s)
@@ -297,7 +307,7 @@ class BaselineTracker:
 
     def catch_up(self, units: Array) -> None:
         """Taxels have drifted by this [n] while they were not received."""
-        self._note_drift(units)
+        self._note_drift(units / self.fineness)
         np.clip(self.baseline + units * self._usable, self._low, self._high, out=self.baseline)
         if self._thermal is not None:
             self._thermal.miss(units != 0.0)
@@ -329,8 +339,8 @@ class BaselineTracker:
     def _configure(self, usable: Mask, settings: Drift) -> None:
         self._usable = usable
         self._settings = settings
-        self._low = self.calibrated - settings.limit_units
-        self._high = self.calibrated + settings.limit_units
+        self._low = self.calibrated - settings.limit_units * self.fineness
+        self._high = self.calibrated + settings.limit_units * self.fineness
         rates = {
             State.IDLE: settings.rate_units_per_s,
             State.DISTURBED: ALONE_UNITS_PER_S,
@@ -415,7 +425,8 @@ class BaselineTracker:
         if forecast is not None:
             change += forecast
         change *= self._usable
-        np.add(self.baseline, change, out=self.baseline)
+        np.add(self._zero, change, out=self._zero)
+        np.multiply(self._zero, self.fineness, out=self.baseline)
         np.fmax(self.baseline, self._low, out=self.baseline)
         np.fmin(self.baseline, self._high, out=self.baseline)
 
@@ -423,7 +434,7 @@ class BaselineTracker:
         """Which taxels [n] read what remains of a touch: for long enough, and not more and more."""
         self._free_s += dt_s
         self._free_s[hidden] = 0.0
-        level = self.baseline + units
+        level = self._zero + units
         np.fmin(self._lowest, level, out=self._lowest)
         self._lowest[hidden] = np.inf
         calm = level < self._lowest + 2.0 * TOLERANCE_UNITS
@@ -447,8 +458,8 @@ class BaselineTracker:
         reading rises: something still presses the foam.
         """
         self._loaded_s -= dt_s
-        free = self.baseline + units
-        self._before[ended] = self.baseline[ended]
+        free = self._zero + units
+        self._before[ended] = self._zero[ended]
         self._taken_level[ended] = level[ended]
         self._taken_free[ended] = free[ended]
         self._risen[ended] = 0.0
@@ -468,7 +479,7 @@ class BaselineTracker:
         expected = (self._taken_level - self._taken_free) - (level - free)
         load = (self._taken_s > 0.0) & (self._risen > TOLERANCE_UNITS) & ~ended
         load &= self._risen > HELD_SHARE * expected
-        given = np.where(load, np.minimum(self._before - self.baseline, 0.0), 0.0)
+        given = np.where(load, np.minimum(self._before - self._zero, 0.0), 0.0)
         self._taken_s -= dt_s
         self._taken_s[load] = 0.0
         self._loaded_s[load & ~touched] = REGRET_S

@@ -195,7 +195,7 @@ class OwnCurves:
         Returns:
             Those of `drifted` that are: the others stay touched while their baselines rise.
         """
-        slow = RISE_UNITS_PER_S * elapsed_s
+        slow = RISE_UNITS_PER_S * drift.fineness * elapsed_s
         shared = np.minimum(drift.shared_units, slow)
         shown = self._shown_units + shared
         if drift.may_be_loaded:

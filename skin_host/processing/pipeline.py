@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from skin_host.config.relaxation import RelaxationSettings
 from skin_host.config.settings import Processing
 from skin_host.layout import Layout, PadKind, PartLayout
-from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration import Calibration, fineness
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.curves import Curve, Parabolas, Reader, TableCurve, Tables
 from skin_host.processing.drift import BaselineTracker
@@ -242,6 +242,7 @@ class _PartPipeline:
             self._triangle_of,
             self._thermal,
             rules.settings.drift,
+            fineness(layout)[mine],
         )
         #: What presses, and what of that is called a touch; mostly they are one.
         self._felt = self._called = TouchDecision(rules.felt, rules.settings.touch.votes_of_3)

@@ -825,6 +825,19 @@ def test_what_cannot_be_linked_is_copied_aside_and_a_folder_is_left(
     assert path.read_text() == "more damage"
 
 
+def test_damaged_files_of_one_second_are_all_set_aside(tmp_path: Path) -> None:
+    """A computer without a clock of its own has the same time at each start."""
+    path = tmp_path / "zeros.json"
+    damages = ["damaged", "damaged otherwise", "and again", "damaged"]
+    for damage in damages:
+        path.unlink(missing_ok=True)
+        path.write_text(damage)
+        set_aside(path)
+    aside = {one.read_text() for one in tmp_path.iterdir() if one != path}
+    assert aside == set(damages)
+    assert len(list(tmp_path.iterdir())) == 1 + len(aside)
+
+
 def test_a_zero_that_is_in_doubt_is_none_to_go_on_with(skin: Skin) -> None:
     layout, kept = skin.layout, skin.calibration(10.0, 0.0)
     first = layout.parts[1].start

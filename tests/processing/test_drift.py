@@ -475,6 +475,43 @@ def test_a_temperature_pad_that_is_missing_tells_of_no_drift():
     assert track.baseline == pytest.approx(begun, abs=0.2)
 
 
+@pytest.mark.parametrize("jump", [-240.0, -60.0, -20.0, -8.0, 8.0, 20.0, 240.0])
+@pytest.mark.parametrize("held", [0, 6])
+def test_a_temperature_pad_that_fails_moves_no_zero_that_others_show_to_be_right(jump, held):
+    """Pads of its triangle that had followed it were touched for ever."""
+    thermal = np.arange(N) % 12 == 11
+    track = tracker(thermal=thermal)
+    rng = np.random.default_rng(5)
+    touched = np.arange(N) < held
+
+    def second(warmth, shift, press=NOBODY):
+        drifted = 0.5 * warmth - track.baseline + np.where(press, 30.0, 0.0)
+        reads = np.where(thermal, warmth + shift * (np.arange(N) == 11), drifted)
+        track.step(reads + rng.normal(0.0, 0.2, N), press, NOBODY, 1.0)
+        return (0.5 * warmth - track.baseline)[~thermal]
+
+    for warmth in np.arange(0.0, 12.0, 0.02):
+        second(warmth, 0.0)
+    errors = [second(12.0, jump, touched) for _ in range(120)]
+    assert np.abs(errors).max() < 1.6
+    assert np.abs(errors[-1]).max() < 0.6
+    errors = [second(12.0, 0.0, touched) for _ in range(60)]
+    assert np.abs(errors).max() < 1.6
+
+
+@pytest.mark.parametrize("jump", [-240.0, -50.0, 50.0, 240.0])
+def test_a_temperature_pad_that_jumps_while_its_whole_triangle_is_pressed_ends_no_press(jump):
+    thermal = np.arange(N) % 12 == 11
+    track = tracker(thermal=thermal)
+    for warmth in np.arange(0.0, 12.0, 0.02):
+        track.step(np.where(thermal, warmth, 0.5 * warmth - track.baseline), NOBODY, NOBODY, 1.0)
+    begun = track.baseline.copy()
+    for _ in range(60):
+        units = np.where(thermal, 12.0 + jump, 30.0 + begun - track.baseline)
+        track.step(units, ~thermal, NOBODY, 1.0)
+    assert track.baseline == pytest.approx(begun, abs=0.1)
+
+
 def test_a_new_zero_says_nothing_of_how_a_taxel_followed_the_temperature():
     """A jump of the readings with that of the temperature pads is no relation of the two."""
     thermal = np.arange(N) % 12 >= 10
@@ -1017,3 +1054,66 @@ def test_a_window_of_no_time_changes_nothing():
         for _ in range(10):
             hold(track, 2.6)
     assert track.baseline == pytest.approx(before, abs=0.1)
+
+
+def in_units_of(fineness, usable=NOBODY):
+    """A tracker of taxels in units that are so many times finer than the usual ones."""
+    usable = usable if usable.any() else ~NOBODY
+    return BaselineTracker(np.zeros(N), usable, TRIANGLE, NOBODY, Drift(), fineness)
+
+
+MIXED = np.where(np.arange(N) < 12, 4.0, 1.0)
+
+
+@pytest.mark.parametrize("fineness", [2.0, 4.0, MIXED])
+@pytest.mark.parametrize("rate", [0.04, 0.2, -0.3])
+def test_drift_is_followed_alike_in_units_of_any_size(fineness, rate):
+    """In the finest ones all of a part that became warm was touched, and so ever after."""
+    track = in_units_of(np.broadcast_to(fineness, N))
+    rng = np.random.default_rng(8)
+    true = 0.0
+    for _ in range(120):
+        true += rate
+        units = true * fineness - track.baseline + rng.normal(0.0, 0.09, N) * fineness
+        assert track.step(units, NOBODY, NOBODY, 1.0) is None
+        assert np.abs((true * fineness - track.baseline) / fineness).max() < 0.5
+
+
+def test_the_drift_of_a_single_pad_is_followed_in_the_finest_units():
+    one = np.arange(N) == 3
+    track = in_units_of(4.0, one)
+    true = 0.0
+    for _ in range(120):
+        true += 4.0 * 0.04
+        track.step(true - track.baseline, NOBODY, NOBODY, 1.0)
+        assert abs(true - track.baseline[3]) < 1.2
+
+
+@pytest.mark.parametrize("fineness", [1.0, 4.0])
+def test_what_a_hand_warms_is_followed_under_the_touch_in_units_of_any_size(fineness):
+    track = in_units_of(fineness)
+    touched = ~NOBODY
+    for second in range(600):
+        drift = 0.008 * fineness * second
+        track.step(25.0 * fineness + drift - track.baseline, touched, NOBODY, 1.0)
+    assert track.baseline == pytest.approx(np.full(N, drift), abs=0.5 * fineness)
+    assert track.frozen.all()
+
+
+@pytest.mark.parametrize("fineness", [1.0, 4.0])
+def test_a_load_that_grows_by_a_kpa_a_second_is_no_drift_in_units_of_any_size(fineness):
+    track = in_units_of(fineness)
+    load = 0.0
+    for _ in range(10):
+        load += 0.5 * fineness
+        track.step(load - track.baseline, NOBODY, NOBODY, 1.0)
+    assert np.abs(track.baseline).max() <= 0.11 * fineness
+
+
+@pytest.mark.parametrize("fineness", [1.0, 4.0])
+def test_the_limit_is_as_far_away_in_units_of_any_size(fineness):
+    track = in_units_of(fineness)
+    for _ in range(120):
+        track.step(np.full(N, -45.0 * fineness) - track.baseline, NOBODY, NOBODY, 5.0)
+    assert track.baseline == pytest.approx(np.full(N, -40.0 * fineness))
+    assert track.at_limit.all()

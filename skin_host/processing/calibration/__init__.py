@@ -18,6 +18,10 @@ from skin_host.processing.masks import Mask
 
 #: A pad with this much noise does not send the same byte for seconds.
 LIVELY_UNITS = 0.6
+#: Of a byte: no activation is larger.
+SCALE_UNITS = 255.0
+#: Nearly all boards send units of this shift.
+USUAL_SHIFT = 2
 
 Floats = NDArray[np.float64]
 
@@ -187,6 +191,15 @@ def identified(calibration: Calibration) -> Calibration:
             digest.update(np.ascontiguousarray(array).tobytes())
         digest.update(np.array([curves.memory.radius_kpa, curves.memory.weight]).tobytes())
     return replace(calibration, id=digest.hexdigest()[:12])
+
+
+def fineness(layout: Layout) -> Floats:
+    """Return how many of the units of each taxel [n] are one at `USUAL_SHIFT`, at least 1: as many
+    times larger are noise and drift in finer units.
+    """
+    finer = [max(USUAL_SHIFT - triangle.shift, 0) for triangle in layout.triangles]
+    found: Floats = np.exp2(np.array(finer))[layout.triangle_of]
+    return found
 
 
 def summary(calibration: Calibration, layout: Layout) -> dict[str, dict[str, int]]:

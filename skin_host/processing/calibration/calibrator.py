@@ -17,8 +17,16 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import TouchSettings
 from skin_host.layout import Layout, PadKind
-from skin_host.processing.calibration import Calibration, Floats, Verdict, identified
+from skin_host.processing.calibration import (
+    SCALE_UNITS,
+    Calibration,
+    Floats,
+    Verdict,
+    fineness,
+    identified,
+)
 from skin_host.processing.calibration.block_means import JOINED, BlockMeans
+from skin_host.processing.calibration.warming import leave_out
 from skin_host.processing.conversions import Conversions
 from skin_host.processing.masks import Mask
 from skin_host.processing.touch import levels
@@ -27,10 +35,9 @@ from skin_host.processing.touch import levels
 #: ...
 NOISY_MARGINS = 1.5
 #: ... and unusable if it needs more than this multiple: 16 units are half the scale of real skin.
+#: Both are of usual units. A pad that is sent in finer ones may need more of them: that is no more
+#: pressure.
 USELESS_MARGINS = 8.0
-#: Both are of units at this shift, which nearly all boards send. A pad that is sent in finer units
-#: may need more of them: that is no more pressure.
-USUAL_SHIFT = 2
 #: With more than this share of its samples at the ends of the scale, a taxel is out of range.
 SATURATED_SHARE = 0.05
 #: A press is cut off if less than this share of the pressure curve's units fits between rest and 0.
@@ -59,6 +66,8 @@ SURE_DEVIATIONS = 6.0
 #: ... and they rise and fall once, or together with another taxel of the triangle.
 PRESS_SWITCHES = 2
 SHARED_CORRELATION = 0.8
+#: Sweeps that are further apart have a gap between them.
+LONGEST_INTERVAL_S = 1.0
 #: A part was pressed as a whole if the mean of its pads moves by more than this, the least
 #: threshold of a touch, five standard errors, and the fastest drift, and this share of them moves
 #: like it.
@@ -134,8 +143,7 @@ class Calibrator:
         self._percentile = percentile
         self._touch = touch or TouchSettings()
         self._range_units = np.full(n, np.inf) if range_units is None else range_units
-        finer = [max(USUAL_SHIFT - triangle.shift, 0) for triangle in layout.triangles]
-        self._fineness = np.exp2(np.array(finer))[layout.triangle_of]
+        self._fineness = fineness(layout)
         self._received = np.zeros(n, dtype=np.int64)
         self._counts = np.zeros((n, 256), dtype=np.int64)
         self._course = BlockMeans(n)
@@ -174,7 +182,8 @@ class Calibrator:
         if t_ns is not None:
             before, self._at_ns[part_index] = self._at_ns[part_index], t_ns
             dt_s = 0.0 if before is None else max((t_ns - before) * 1e-9, 0.0)
-            self._passed_s[part_index] += dt_s
+            # A gap, or a clock that is set, is no time in which pads were seen to move slowly.
+            self._passed_s[part_index] += min(dt_s, LONGEST_INTERVAL_S)
             repeated = self._conversions[part_index].step(raw.copy(), dt_s)
             new = present if repeated is None else present & ~repeated
         self._counts[taxels[new], raw[new]] += 1
@@ -186,6 +195,9 @@ class Calibrator:
         self._course.forget(taxels)
         self._times_off[taxels] = 0
         self._off = [one.of(~np.isin(one.taxel, taxels)) for one in self._off]
+        for index, part in enumerate(self._layout.parts):
+            if not self._received[part.start : part.stop].any():
+                self._passed_s[index] = 0.0
 
     def finish(
         self,
@@ -217,7 +229,13 @@ class Calibrator:
         wanted = np.ceil(self._percentile * samples - 1e-9)
         from_top = np.argmax(cumulative >= wanted[:, np.newaxis], axis=1)
         percentile = no_load - (255.0 - from_top)
+        as_measured = variance
+        warmed, drift_variance = self._leave_out_warming()
+        baseline = baseline - warmed
+        variance = np.maximum(variance - drift_variance, 0.0)
         noise = np.sqrt(variance)
+        warms = drift_variance > 0.0
+        percentile = np.where(warms, baseline + 1.645 * noise, percentile)
         lasting = self._lasting(variance, received / some)
 
         course = self._course
@@ -236,7 +254,11 @@ class Calibrator:
         baseline = np.where(touched, no_load - course.rest(error), baseline)
         percentile = np.where(touched, baseline + 1.645 * steady_noise, percentile)
         noise = np.where(touched, steady_noise, noise)
-        upward = np.where(touched, noise**2, _upward_variance(counts, variance, self._touch))
+        upward = _upward_variance(counts, as_measured, self._touch)
+        surely = _underestimated(some)
+        of_drift = drift_variance * np.maximum(surely, 1.0 + SMOOTHED_SHARE)
+        noisier = np.maximum(upward - of_drift, variance * surely)
+        upward = np.where(touched, noise**2, np.where(warms, noisier, upward))
         spread = np.sqrt(upward * np.where(touched, 1.0, lasting))
         unknown = samples < NOISE_SAMPLES
         if before is not None:
@@ -272,6 +294,7 @@ class Calibrator:
         few |= unknown & (verdict == Verdict.OUT_OF_RANGE)
         verdict[few] = Verdict.TOO_FEW
         verdict[received == 0] = Verdict.ABSENT
+        percentile = np.minimum(percentile, SCALE_UNITS)
         # What a few bytes scatter by is not their noise: too little would call it damaged later.
         for array in (baseline, percentile, noise, spread):
             array[few] = 0.0
@@ -350,6 +373,25 @@ class Calibrator:
         found = np.zeros(n, np.bool_)
         found[left.taxel] = True
         return found
+
+    def _leave_out_warming(self) -> tuple[Floats, Floats]:
+        """Leave what the pads of a part drift by together out of their courses; return by how much
+        the bytes at the end are above their mean, and the variance of the drift, [n] each.
+        """
+        layout, received = self._layout, self._received
+        end, variance = np.zeros(len(received)), np.zeros(len(received))
+        pressure = layout.pad_kind == PadKind.PRESSURE
+        for part, passed_s in zip(layout.parts, self._passed_s, strict=True):
+            mine = slice(part.start, part.stop)
+            steadily = received[mine] >= max(RECEIVED_SHARE * received[mine].max(), 1.0)
+            pads = np.flatnonzero(steadily & pressure[mine]) + part.start
+            if not len(pads):
+                continue
+            fastest = DRIFT_UNITS_PER_S * float(np.median(self._fineness[pads]))
+            found = leave_out(self._course, pads, passed_s, fastest)
+            if found is not None:
+                end[pads], variance[pads] = found
+        return end, variance
 
     def _froze(self, variance: Floats) -> Mask:
         """Return the taxels [n] whose triangle was no longer received, and no pad of it had sent
@@ -556,12 +598,13 @@ def going_on(found: Calibration, known: Known) -> Calibration:
     """
     before = known.calibration
     unchanged = (found.verdict >= Verdict.ABSENT) & known.zeroed & before.usable
-    above = before.percentile - before.baseline
+    baseline = np.clip(known.baseline, -SCALE_UNITS, SCALE_UNITS)
+    percentile = np.minimum(baseline + (before.percentile - before.baseline), SCALE_UNITS)
     return identified(
         replace(
             found,
-            baseline=np.where(unchanged, known.baseline, found.baseline),
-            percentile=np.where(unchanged, known.baseline + above, found.percentile),
+            baseline=np.where(unchanged, baseline, found.baseline),
+            percentile=np.where(unchanged, percentile, found.percentile),
             noise=np.where(unchanged, before.noise, found.noise),
             spread=np.where(unchanged, before.spread, found.spread),
             verdict=np.where(unchanged, before.verdict, found.verdict),

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from enum import IntEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -9,10 +10,11 @@ import msgspec
 import numpy as np
 
 from skin_host.config.settings import TouchSettings
-from skin_host.errors import CalibrationError, OtherSkinError
+from skin_host.errors import CalibrationError, OtherSkinError, visible
 from skin_host.files import read_document, write_document
 from skin_host.layout import Layout
 from skin_host.processing.calibration import (
+    SCALE_UNITS,
     Calibration,
     Floats,
     Verdict,
@@ -25,8 +27,6 @@ SCHEMA = "skin.calibration/1"
 #: Channels of a force/torque board.
 CHANNELS = 6
 
-#: Of a byte.
-SCALE_UNITS = 255.0
 #: Of the numbers of a file. Beyond them a pad would feel nothing, or anything, and be valid.
 _BOUNDS = {
     "baseline": (-SCALE_UNITS, SCALE_UNITS),
@@ -200,19 +200,22 @@ def load_calibration(path: Path, layout: Layout, configuration: str) -> Calibrat
             if given is None:
                 given = stored.noise if name == "spread" else np.ones(part.n_taxels)
             values, (least, most) = np.array(given), _BOUNDS[name]
-            wrong = values.shape != (part.n_taxels,)
-            if wrong or not np.all((values >= least) & (values <= most)):
-                raise refused(
-                    f"parts.{part.name}.{name}: wanted {part.n_taxels} finite numbers "
-                    f"from {least:g} to {most:g}"
-                )
+            wanted = (
+                f"parts.{part.name}.{name}: wanted {part.n_taxels} finite numbers "
+                f"from {least:g} to {most:g}"
+            )
+            if len(values) != part.n_taxels:
+                raise refused(f"{wanted}, seen {len(values)}")
+            wrong = np.flatnonzero(~((values >= least) & (values <= most)))
+            if len(wrong):
+                raise refused(f"{wanted}, seen {values[wrong[0]]:g} of taxel {wrong[0]}")
             array[mine] = values
         if len(stored.verdict) != part.n_taxels:
-            raise refused(f"parts.{part.name}.verdict: wanted {part.n_taxels} words")
-        try:
-            verdict[mine] = [Verdict[name.upper()] for name in stored.verdict]
-        except KeyError as error:
-            raise refused(f"parts.{part.name}.verdict: {error}") from None
+            raise refused(
+                f"parts.{part.name}.verdict: wanted {part.n_taxels} words, seen "
+                f"{len(stored.verdict)}"
+            )
+        verdict[mine] = _numbers(stored.verdict, Verdict, f"parts.{part.name}.verdict", refused)
         above = arrays["percentile"][mine] - arrays["baseline"][mine]
         decides = levels(above, arrays["spread"][mine], TouchSettings()).decides
         deaf = np.flatnonzero((decides > SCALE_UNITS) & (verdict[mine] < Verdict.STUCK))
@@ -252,6 +255,22 @@ def load_calibration(path: Path, layout: Layout, configuration: str) -> Calibrat
         damaged=None,
         **arrays,
     )
+
+
+def _numbers(
+    words: list[str],
+    kind: type[IntEnum],
+    where: str,
+    refused: Callable[[str], CalibrationError],
+) -> list[int]:
+    """Return the verdicts of taxels as numbers; errors are raised through `refused`."""
+    known = {verdict.name.lower(): int(verdict) for verdict in kind}
+    for taxel, word in enumerate(words):
+        if word.lower() not in known:
+            raise refused(
+                f'{where}: seen "{visible(word[:32])}" of taxel {taxel}, wanted {", ".join(known)}'
+            )
+    return [known[word.lower()] for word in words]
 
 
 def find_calibration(path: Path, layout: Layout, configuration: str) -> Calibration | None:
@@ -295,10 +314,7 @@ def _curves_of(
         if any(len(values) != part.n_taxels for values in msgspec.structs.astuple(stored)):
             raise refused(f"{where}: wanted {part.n_taxels} entries of each kind")
         mine = slice(part.start, part.stop)
-        try:
-            verdict[mine] = [CurveVerdict[name.upper()] for name in stored.verdict]
-        except KeyError as unknown:
-            raise refused(f"{where}.verdict: {unknown}") from None
+        verdict[mine] = _numbers(stored.verdict, CurveVerdict, f"{where}.verdict", refused)
         for taxel, curve in enumerate(stored.kpa, part.start):
             if curve is not None:
                 if len(curve) != len(KNOTS_UNITS) or not np.all(np.abs(curve) <= MOST):

@@ -9,6 +9,7 @@ import pytest
 from skin_host.errors import CalibrationError
 from skin_host.processing import calibration
 from skin_host.processing.calibration import Verdict
+from skin_host.processing.calibration.calibrator import Calibrator, Known
 from skin_host.processing.calibration.file import (
     find_calibration,
     load_calibration,
@@ -79,6 +80,23 @@ def test_pads_that_are_not_used_may_have_any_noise(untouched, tmp_path):
     assert load_calibration(path, LAYOUT, "abc").spread[3] == 4000.0
 
 
+@pytest.mark.parametrize("sweeps", [45, 5])
+def test_what_is_kept_of_noise_near_the_end_of_the_scale_can_be_read_again(tmp_path, sweeps):
+    """The file was refused at the next start: its percentiles were beyond a byte."""
+    rng = np.random.default_rng(4)
+    path = tmp_path / "calibration.json"
+    before = calibrated(noisy(rng, sd=4.0, level=60.0))
+    before = replace(before, percentile=before.baseline + 24.0)
+    known = Known(before, np.full(N, 238.0), np.ones(N, bool))
+    calibrator = Calibrator(LAYOUT)
+    for raw in noisy(rng, sweeps, sd=0.3, level=4.0):
+        calibrator.add(0, raw.astype(np.uint8), np.ones(N, bool))
+    found = calibrator.finish("abc", TIME, known)
+    assert found.usable.any()
+    save_calibration(path, found, LAYOUT)
+    assert load_calibration(path, LAYOUT, "abc").percentile.max() <= 255.0
+
+
 def test_gains_outlive_a_new_zero(untouched, tmp_path):
     path = tmp_path / "calibration.json"
     assert find_calibration(path, LAYOUT, "abc") is None
@@ -122,8 +140,11 @@ def damaged(document, path):
         (lambda d: d.update(configuration="xyz"), "belongs to configuration xyz"),
         (lambda d: d["parts"].clear(), 'no part "skin"'),
         (lambda d: d["parts"]["skin"]["baseline"].pop(), "parts.skin.baseline: wanted 192"),
+        (lambda d: d["parts"]["skin"]["baseline"].pop(), "from -255 to 255, seen 191;"),
         (lambda d: d["parts"]["skin"]["gain"].__setitem__(3, -1.0), "parts.skin.gain"),
+        (lambda d: d["parts"]["skin"]["gain"].__setitem__(3, -1.0), "to 100, seen -1 of taxel 3;"),
         (lambda d: d["parts"]["skin"]["verdict"].__setitem__(3, "fine"), "parts.skin.verdict"),
+        (lambda d: d["parts"]["skin"]["verdict"].__setitem__(3, "o\nk"), "of taxel 3, wanted ok,"),
         (lambda d: d.pop("time"), "not a calibration file"),
         # With these a pad would be valid and feel nothing, or anything.
         (lambda d: d["parts"]["skin"]["baseline"].__setitem__(3, 300.0), "from -255 to 255"),

@@ -612,3 +612,106 @@ def test_a_drift_that_is_followed_is_no_touch_in_a_long_calibration():
     for number, raw in enumerate(slowly_pressed(1.8, 1.2, 600)):
         calibrator.add(0, np.asarray(raw, np.uint8), PRESENT, number * 50_000_000)
     assert not (calibrator.finish("abc", TIME).verdict == Verdict.TOUCHED).any()
+
+
+def warmed(rate, seconds, sd, press=None, seed=3, period_s=0.05):
+    """A calibration of a part that becomes warmer or colder by `rate` units a second, each pad by
+    up to a fifth more or less, and the activations of its pads at the end.
+
+    `press(t)` is subtracted from the readings at time t.
+    """
+    rng = np.random.default_rng(seed)
+    rates = rate * rng.uniform(0.8, 1.2, N)
+    rest = rng.uniform(225.0, 235.0, N)
+    calibrator = Calibrator(LAYOUT)
+    for number in range(round(seconds / period_s)):
+        t_s = number * period_s
+        reads = rest - rates * t_s + rng.normal(0.0, sd, N)
+        reads = reads - (0.0 if press is None else press(t_s))
+        raw = np.clip(np.rint(reads), 0, 255).astype(np.uint8)
+        calibrator.add(0, raw, PRESENT, round(t_s * 1e9))
+    return calibrator.finish("abc", TIME), 240.0 - rest + rates * seconds
+
+
+PRESSURE = LAYOUT.pad_kind == PadKind.PRESSURE
+
+
+@pytest.mark.parametrize("sd", [0.4, 1.2])
+@pytest.mark.parametrize(
+    ("rate", "seconds"), [(0.04, 60), (-0.04, 60), (0.01, 300), (0.09, 120), (-0.09, 120)]
+)
+def test_a_part_that_becomes_warm_while_it_is_calibrated_has_the_zeros_and_noise_of_the_end(
+    rate, seconds, sd
+):
+    """All of its pads were called touched, and were so ever after where it became warmer."""
+    found, at_end = warmed(rate, seconds, sd)
+    assert (found.verdict[PRESSURE] == Verdict.OK).all()
+    assert np.abs(found.baseline - at_end)[PRESSURE].max() < 0.5
+    steady, _ = warmed(0.0, seconds, sd)
+    assert found.noise[PRESSURE] == pytest.approx(steady.noise[PRESSURE], abs=0.25)
+    more = (found.spread - steady.spread)[PRESSURE]
+    assert more.min() > -0.3
+    assert more.max() < 1.0
+
+
+def test_slow_boards_that_become_warm_are_calibrated_alike():
+    found, at_end = warmed(0.04, 60, 0.4, period_s=0.2)
+    assert (found.verdict[PRESSURE] == Verdict.OK).all()
+    assert np.abs(found.baseline - at_end)[PRESSURE].max() < 0.5
+
+
+def test_pads_that_are_touched_while_their_part_becomes_warm_are_named():
+    pressed = np.flatnonzero(PRESSURE)[:5]
+
+    def press(t_s):
+        return np.where(np.isin(np.arange(N), pressed), 12.0 * (t_s < 20.0), 0.0)
+
+    found, at_end = warmed(0.04, 60, 0.4, press)
+    assert (found.verdict[pressed] == Verdict.TOUCHED).all()
+    others = np.setdiff1d(np.flatnonzero(PRESSURE), pressed)
+    assert (found.verdict[others] == Verdict.OK).all()
+    assert np.abs(found.baseline - at_end)[others].max() < 0.5
+    assert np.abs(found.baseline - at_end)[pressed].max() < 2.5
+
+
+@pytest.mark.parametrize("rise_s", [0.5, 5.0, 20.0])
+def test_a_press_of_the_whole_part_is_no_warmth_however_long_the_calibration(rise_s):
+    found, _ = warmed(0.0, 120, 0.4, lambda t_s: np.clip((t_s - 50.0) / rise_s, 0.0, 1.0) * 12.0)
+    assert (found.verdict[PRESSURE] == Verdict.TOUCHED).all()
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 3600.0])
+def test_a_computer_that_slept_during_a_calibration_makes_no_press_slow(gap_s):
+    calibrator = Calibrator(LAYOUT)
+    for number, raw in enumerate(slowly_pressed(2.0, 1.2, 250)):
+        t_ns = number * 20_000_000 + (number > 60) * round(gap_s * 1e9)
+        calibrator.add(0, np.asarray(raw, np.uint8), PRESENT, t_ns)
+    touched = calibrator.finish("abc", TIME).verdict == Verdict.TOUCHED
+    assert touched[20:][PRESSURE[20:]].mean() > 0.9
+
+
+def test_dead_pads_do_not_hide_that_the_others_become_warm():
+    dead = np.flatnonzero(PRESSURE)[::3]
+    calibrator = Calibrator(LAYOUT)
+    rng = np.random.default_rng(6)
+    for number in range(1200):
+        raw = np.rint(230.0 - 0.002 * number + rng.normal(0.0, 0.4, N))
+        raw[dead] = 180.0
+        calibrator.add(0, raw.astype(np.uint8), PRESENT, number * 50_000_000)
+    found = calibrator.finish("abc", TIME)
+    lively = np.setdiff1d(np.flatnonzero(PRESSURE), dead)
+    assert not (found.verdict[lively] == Verdict.TOUCHED).any()
+    assert np.abs(found.baseline[lively] - 12.4).max() < 0.3
+    assert found.baseline[dead] == pytest.approx(60.0)
+
+
+def test_what_a_part_did_before_its_board_was_zeroed_makes_no_press_slow():
+    calibrator = Calibrator(LAYOUT)
+    for number in range(1200):
+        calibrator.add(0, np.full(N, 230, np.uint8), PRESENT, number * 50_000_000)
+    calibrator.forget(np.arange(N))
+    for number, raw in enumerate(slowly_pressed(2.0, 1.2, 250), 1200):
+        t_ns = 1200 * 50_000_000 + (number - 1200) * 20_000_000
+        calibrator.add(0, np.asarray(raw, np.uint8), PRESENT, t_ns)
+    touched = calibrator.finish("abc", TIME).verdict == Verdict.TOUCHED
+    assert touched[20:][PRESSURE[20:]].mean() > 0.9
