@@ -42,7 +42,8 @@ class LoadTable(NamedTuple):
 def read_table(path: Path) -> LoadTable:
     """Read a table of at least two samples, all finite.
 
-    A first line without numbers is a heading; lines that start with # are remarks.
+    A first line without numbers is a heading; lines that start with # are remarks. Fields may stand
+    in quotes.
 
     Raises:
         RequestError: unreadable, or not such a table; the message names file and line.
@@ -54,14 +55,17 @@ def read_table(path: Path) -> LoadTable:
     except UnicodeDecodeError:
         raise RequestError(f"{path}: not text; {WANTED}") from None
     rows: list[tuple[float, float]] = []
+    headed = False
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.startswith("#"):
             continue
-        fields = line.split(",")
+        fields = [field.strip().strip('"') for field in line.split(",")]
         try:
             time_s, kpa = map(float, fields)
         except ValueError:
-            if not rows and len(fields) == 2 and not any(map(_is_number, fields)):
+            heads = not (rows or headed or any(map(_is_number, fields)))
+            if heads and len(fields) == 2:
+                headed = True
                 continue
             raise RequestError(f'{path}:{number}: "{line[:60]}"; {WANTED}') from None
         if not (np.isfinite(time_s) and np.isfinite(kpa)):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import load
 from skin_host.daemon.calibrate import calibration_path
+from skin_host.errors import RequestError
 from skin_host.processing.curves import CurveVerdict, Memory
 from skin_host.processing.fitting.memory import loading_kpa
 from skin_host.recording.load_table import LoadTable, read_table, without_spikes
@@ -187,6 +188,21 @@ def test_a_table_of_a_spreadsheet_is_read_from_its_first_line_on(
     table = read_table(path)
     assert table.time_s.tolist() == [0.0, 0.1]
     assert table.kpa.tolist() == [1.5, 2.5]
+
+
+@pytest.mark.parametrize("heading", ['"time_s","pressure_kpa"\n', ""])
+def test_a_table_whose_fields_stand_in_quotes_is_read(tmp_path: Path, heading: str) -> None:
+    path = tmp_path / "course.csv"
+    path.write_text(f'{heading}"0.0","1.5"\n"0.1", "2.5"\n')
+    table = read_table(path)
+    assert (table.time_s.tolist(), table.kpa.tolist()) == ([0.0, 0.1], [1.5, 2.5])
+
+
+def test_a_table_without_numbers_is_refused_with_its_first_wrong_line(tmp_path: Path) -> None:
+    path = tmp_path / "course.csv"
+    path.write_text("time_s,pressure_kpa\ns,kPa\n0.0,1.5\n")
+    with pytest.raises(RequestError, match=r'course.csv:2: "s,kPa"; wanted rising times'):
+        read_table(path)
 
 
 @pytest.mark.parametrize("addresses", ["3", "34"], ids=["one board", "all"])
