@@ -263,6 +263,8 @@ class Calibrator:
         unknown = samples < NOISE_SAMPLES
         if before is not None:
             unknown &= ~before.usable
+            # Presses that come and go leave more in it than a quiet pad has: it would seem stuck.
+            noise = np.where(touched & before.usable, np.fmin(noise, before.noise), noise)
             noisier = (samples < KNOWN_SAMPLES) & before.usable & (before.spread > spread)
             noise = np.where(noisier, np.fmax(noise, before.noise), noise)
             spread = np.where(noisier, before.spread, spread)

@@ -86,6 +86,20 @@ def test_a_touch_during_calibration_is_named_and_left_out_of_the_baseline(first,
     assert found.noise[7] < 1.0
 
 
+def test_presses_that_come_and_go_in_a_calibration_do_not_raise_the_noise_that_is_known():
+    """A quiet pad was taken for one with a unit of noise, and soon afterwards for stuck."""
+    before = calibrated(noisy(np.random.default_rng(5)))
+    sweeps = noisy(np.random.default_rng(6), sweeps=61)
+    for first, last, units in ((6, 27, 4), (33, 61, 7)):
+        sweeps[first:last, 7:9] -= units
+    calibrator = Calibrator(LAYOUT)
+    for raw in sweeps:
+        calibrator.add(0, raw.astype(np.uint8), PRESENT)
+    found = calibrator.finish("abc", TIME, Known(before, before.baseline, PRESENT))
+    assert found.verdict[7] == Verdict.TOUCHED
+    assert found.noise[7] == before.noise[7]
+
+
 @pytest.mark.parametrize(
     ("sd", "sweeps"), [(0.4, 25), (0.7, 25), (0.7, 125), (1.5, 50), (1.5, 400)]
 )
