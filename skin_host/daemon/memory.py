@@ -17,8 +17,8 @@ from skin_host.daemon.joining import Memories, NodeFiles, NodeMemory
 from skin_host.daemon.state import (
     NodeState,
     Zeros,
-    baselines_of,
     is_there,
+    kept_or,
     kept_path,
     load_kept,
     seconds_of,
@@ -152,10 +152,8 @@ def known_of(calibration: Calibration, zeros: Zeros, layout: Layout) -> Known:
     The zeros of taxels that were touched when a daemon ended are in doubt: the set-up of their
     board has taken what touched them into its zero.
     """
-    baseline = calibration.baseline.copy()
-    if zeros.are_of(calibration.id):
-        for part, kept in baselines_of(layout, zeros.baselines):
-            baseline[part.start : part.stop] = kept
+    kept = zeros.baselines if zeros.are_of(calibration.id) else {}
+    baseline = kept_or(calibration.baseline, layout, kept)
     doubted = taxels_of(layout, zeros.unknown) | taxels_of(layout, zeros.touched)
     return Known(calibration, baseline, ~doubted)
 

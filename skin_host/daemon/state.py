@@ -157,6 +157,16 @@ def baselines_of(
             yield part, np.array(kept)
 
 
+def kept_or(
+    otherwise: NDArray[np.float64], layout: Layout, baselines: Mapping[str, list[float]]
+) -> NDArray[np.float64]:
+    """Return the baselines [n] that were kept, and of parts without any those `otherwise`."""
+    found = otherwise.copy()
+    for part, kept in baselines_of(layout, baselines):
+        found[part.start : part.stop] = kept
+    return found
+
+
 Kept = TypeVar("Kept", NodeState, Zeros)
 
 

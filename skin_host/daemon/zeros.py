@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from skin_host.daemon.state import Zeros, baselines_of, taxels_of
+from skin_host.daemon.state import Zeros, baselines_of, kept_or, taxels_of
 from skin_host.layout import PadKind
 from skin_host.processing.core import Engine
-from skin_host.processing.masks import Mask
+from skin_host.processing.masks import Mask, any_of
 
 #: Baselines are kept again once most pads of a part have drifted by so many units: by more, noise
 #: would touch pads at the start after a crash, until their boards are set up.
@@ -91,14 +91,11 @@ def _have_drifted(engine: Engine, before: Zeros) -> bool:
     calibration, pipeline, layout = engine.calibration, engine.pipeline, engine.layout
     assert calibration is not None
     assert pipeline is not None
-    kept_units = calibration.baseline.copy()
-    for part, baselines in baselines_of(layout, before.baselines):
-        kept_units[part.start : part.stop] = baselines
+    kept_units = kept_or(calibration.baseline, layout, before.baselines)
     pads = calibration.usable & (layout.pad_kind == PadKind.PRESSURE)
     moved_units = np.abs(pipeline.baseline - kept_units)
-    return any(
-        bool(np.median(moved_units[mine][pads[mine]]) >= DRIFTED_UNITS)
-        for part in engine.parts
-        for mine in (slice(layout.parts[part].start, layout.parts[part].stop),)
-        if pads[mine].any()
-    )
+    for part in (layout.parts[index] for index in engine.parts):
+        mine = slice(part.start, part.stop)
+        if any_of(pads[mine]) and np.median(moved_units[mine][pads[mine]]) >= DRIFTED_UNITS:
+            return True
+    return False

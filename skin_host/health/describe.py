@@ -23,7 +23,7 @@ from skin_host.health.record import (
 )
 from skin_host.health.watch import Watch
 from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
-from skin_host.processing.calibration import USUAL_SHIFT, Calibration, Verdict
+from skin_host.processing.calibration import USUAL_SHIFT, Calibration, Verdict, fineness
 from skin_host.processing.core import Engine
 from skin_host.processing.far_presses import FAR_PADS
 from skin_host.processing.intake import lifted
@@ -93,7 +93,7 @@ class Describer:
         shifts = np.array([triangle.shift for triangle in self._layout.triangles])
         #: One unit of each taxel [n], in units of the usual shift.
         self._unit = np.exp2(shifts - USUAL_SHIFT)[self._layout.triangle_of]
-        self._fineness = np.fmax(1.0 / self._unit, 1.0)
+        self._fineness = fineness(self._layout)
         #: For each part its baselines at the last looks, their times, and which zeros they are of.
         self._baselines: dict[int, deque[tuple[int, int, Calibration, NDArray[np.float64]]]] = {}
         #: Since when triangles, by board and number, have not changed after a calibration in which

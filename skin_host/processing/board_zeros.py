@@ -674,9 +674,8 @@ class BoardZeros:
         ledger, rezero = self._ledger, self.rezeros.get(sweep.board)
         answered = ledger.answered(row)
         far = ledger.far[row] & answered[:, None]
-        below, same = below_zero(sweep.raw, far), self._of_same_chip(sweep, row, far)
-        if same is not None:
-            below |= same[:, None] & far & (sweep.raw == END)
+        same = self._of_same_chip(sweep, row, far)[:, None]
+        below = below_zero(sweep.raw, far) | (same & far & (sweep.raw == END))
         pressed, is_new = np.zeros_like(below), False
         if rezero is not None:
             pressed = rezero.unknown.reshape(TRIANGLES, PADS)
@@ -685,13 +684,14 @@ class BoardZeros:
         received = answered, ledger.present[row]
         wrong = self._wrong.note_below(sweep, below, received, pressed, no_load, is_new=is_new)
         self._doubt_pads(sweep, wrong)
-        if same is not None and any_of(wrong & same[:, None]):
-            explained = self._intake.zeroed_pressed.get(row, np.zeros_like(wrong))
-            self._intake.zeroed_pressed[row] = explained | (wrong & same[:, None])
+        explained = wrong & same
+        if any_of(explained):
+            before = self._intake.zeroed_pressed.get(row)
+            self._intake.zeroed_pressed[row] = explained if before is None else before | explained
 
-    def _of_same_chip(self, sweep: Sweep, row: int, far: Mask) -> Mask | None:
+    def _of_same_chip(self, sweep: Sweep, row: int, far: Mask) -> Mask:
         """Return the triangles bool[16] of which pads read far below zero, as another chip's would,
-        and the others have shown that they are not; None if there are none.
+        and the others have shown that they are not.
 
         Args:
             sweep: of a board.
@@ -699,8 +699,8 @@ class BoardZeros:
             far: bool[16, 12], its pads that are far out of range.
         """
         pipeline, calibration = self._pipeline, self._calibration
-        if pipeline is None or calibration is None or row in self._ledger.twice:
-            return None
+        assert pipeline is not None
+        assert calibration is not None
         resting = self._intake.reads_another(row, sweep.raw)
         if any_of(resting):
             taxels = self._of(sweep.board)
@@ -713,8 +713,7 @@ class BoardZeros:
                 known,
                 self._layout.pad_kind[taxels] == PadKind.PRESSURE,
             )
-        same = self._wrong.note_resting(sweep.board, resting, self._ledger.present[row])
-        return same if any_of(same) else None
+        return self._wrong.note_resting(sweep.board, resting, self._ledger.present[row])
 
     def _note_at_end(self, sweep: Sweep, row: int) -> None:
         """Doubt pads that rest at the end of the scale, or beyond it."""

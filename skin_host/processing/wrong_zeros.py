@@ -117,7 +117,10 @@ class WrongZeros:
             resting: bool[16], those whose other pads rest in a sweep, see `others_rest`.
             present: bool[16], those that were received in it.
         """
-        before = self._others_rest.pop(board, _NO_TRIANGLES)
+        before = self._others_rest.pop(board, None)
+        if before is None and not any_of(resting):
+            return resting
+        before = _NO_TRIANGLES if before is None else before
         lasted = np.where(present, (before + 1) * resting, before)
         if any_of(lasted > 0):
             self._others_rest[board] = lasted
@@ -155,8 +158,8 @@ def others_rest(
     known: Mask,
     pressure: Mask,
 ) -> Mask:
-    """Return the triangles bool[16] of which pads read far below zero, and the others show that it
-    is not another chip that reads so.
+    """Return the triangles bool[16] of which other pads than those that read far below zero show
+    that it is not another chip that reads so.
 
     Args:
         above_units: float64[16, 12], what each pad reads above its baseline.
@@ -168,6 +171,6 @@ def others_rest(
     resting = known & ~far & (np.abs(above_units) < enter_units)
     # What lifts brings no pad above where it rests. One that warms up may be.
     raised = known & pressure & (above_units >= enter_units)
-    below = far & (above_units < 0.0)
-    found: Mask = (count_of(below) > 0) & (count_of(raised | (far & ~below)) == 0)
-    return found & (count_of(resting) >= RESTING_PADS)
+    raised |= far & (above_units >= 0.0)
+    found: Mask = (count_of(resting) >= RESTING_PADS) & (count_of(raised) == 0)
+    return found

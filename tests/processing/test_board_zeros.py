@@ -93,6 +93,18 @@ class Hand:
             del frames[:2]
         self.deliver(self.engine.feed(self._board.settings.bus, FrameBatch.of(frames)))
 
+    def frames_from_now(self) -> list[PressureFrame]:
+        """Return a list to which the frames of all that follows are added."""
+        frames: list[PressureFrame] = []
+        self.deliver = lambda output: frames.extend(output.frames)
+        return frames
+
+    def rest_on_a_new_zero(self) -> None:
+        """Send untouched sweeps, be zeroed, and send more until the new zero is in use."""
+        self.send(40)
+        self.engine.zeros.rezero(0)
+        self.send(60)
+
     def pause(self, seconds: float) -> None:
         """Send nothing, while the bus is read."""
         for _ in range(round(seconds * 1e9 / PERIOD_NS)):
@@ -161,8 +173,7 @@ def test_pads_that_lift_after_a_zero_under_a_press_show_no_other_chip(hand: Hand
     """The others of their triangle were not valid until all were pressed again, and their zeros
     did not follow the temperature meanwhile.
     """
-    frames: list[PressureFrame] = []
-    hand.deliver = lambda output: frames.extend(output.frames)
+    frames = hand.frames_from_now()
     pressed = {f"p{pad}": 200 for pad in (1, 2, 3, 4, 5)}
     hand.send(40, **pressed)
     hand.engine.zeros.rezero(0)
@@ -177,11 +188,8 @@ def test_pads_that_lift_after_a_press_that_nobody_knew_of_show_no_other_chip(
     hand: Hand, below: int
 ) -> None:
     """The pads that rest where they did are those of the same chip, and stay valid."""
-    frames: list[PressureFrame] = []
-    hand.deliver = lambda output: frames.extend(output.frames)
-    hand.send(40)
-    hand.engine.zeros.rezero(0)
-    hand.send(60)
+    frames = hand.frames_from_now()
+    hand.rest_on_a_new_zero()
     lifted = {f"p{pad}": FAR_BELOW for pad in range(below)}
     hand.send(10, **lifted)
     assert hand.in_doubt == list(range(below))
@@ -205,11 +213,8 @@ def test_pads_far_below_zero_are_of_another_chip_where_others_do_not_rest(
     hand: Hand, others: dict[int, int]
 ) -> None:
     """Fewer than two rest where they did, or one reads what lifting nothing brings it to."""
-    frames: list[PressureFrame] = []
-    hand.deliver = lambda output: frames.extend(output.frames)
-    hand.send(40)
-    hand.engine.zeros.rezero(0)
-    hand.send(60)
+    frames = hand.frames_from_now()
+    hand.rest_on_a_new_zero()
     hand.send(10, p0=FAR_BELOW, p1=FAR_BELOW, **{f"p{pad}": raw for pad, raw in others.items()})
     assert not frames[-1].valid[:12].any()
 
@@ -219,8 +224,7 @@ def test_a_pad_that_rests_at_the_end_of_its_scale_was_pressed_when_its_board_was
 ) -> None:
     """Its board marks it only at twice the range; up to there nothing shows where it rests."""
     hand.marks_far = False
-    frames: list[PressureFrame] = []
-    hand.deliver = lambda output: frames.extend(output.frames)
+    frames = hand.frames_from_now()
     hand.send(95, p3=255)
     assert hand.in_doubt == []
     hand.send(10, p3=255)
@@ -641,8 +645,7 @@ def test_what_touched_pads_read_after_a_silence_shows_no_zero(hand: Hand) -> Non
 
 
 def test_taxels_of_a_held_board_show_nothing_until_it_is_released(hand: Hand) -> None:
-    frames: list[PressureFrame] = []
-    hand.deliver = lambda output: frames.extend(output.frames)
+    frames = hand.frames_from_now()
     zeros, own = hand.engine.zeros, hand.engine.layout.taxels_of([0])
     for held in (False, True, False):
         frames.clear()
@@ -1041,8 +1044,7 @@ def test_a_press_that_is_called_no_touch_is_in_doubt_after_a_zero_under_it() -> 
 
 def test_no_baseline_follows_a_press_that_is_called_no_touch() -> None:
     def reads(hand: Hand) -> float:
-        frames: list[PressureFrame] = []
-        hand.deliver = lambda output: frames.extend(output.frames)
+        frames = hand.frames_from_now()
         press_lightly(hand, 600)
         return float(np.mean([frame.pressure_kpa[3] for frame in frames[-20:]]))
 

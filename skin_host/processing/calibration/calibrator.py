@@ -66,8 +66,9 @@ SURE_DEVIATIONS = 6.0
 #: ... and they rise and fall once, or together with another taxel of the triangle.
 PRESS_SWITCHES = 2
 SHARED_CORRELATION = 0.8
-#: Sweeps that are further apart have a gap between them.
-LONGEST_INTERVAL_S = 1.0
+#: A longer interval between two samples of a calibration does not count for its time: nothing was
+#: received, or the clock was set.
+LONGEST_INTERVAL_NS = 1_000_000_000
 #: A part was pressed as a whole if the mean of its pads moves by more than this, the least
 #: threshold of a touch, five standard errors, and the fastest drift, and this share of them moves
 #: like it.
@@ -183,7 +184,7 @@ class Calibrator:
             before, self._at_ns[part_index] = self._at_ns[part_index], t_ns
             dt_s = 0.0 if before is None else max((t_ns - before) * 1e-9, 0.0)
             # A gap, or a clock that is set, is no time in which pads were seen to move slowly.
-            self._passed_s[part_index] += min(dt_s, LONGEST_INTERVAL_S)
+            self._passed_s[part_index] += min(dt_s, LONGEST_INTERVAL_NS * 1e-9)
             repeated = self._conversions[part_index].step(raw.copy(), dt_s)
             new = present if repeated is None else present & ~repeated
         self._counts[taxels[new], raw[new]] += 1

@@ -6,7 +6,12 @@ import numpy as np
 
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration
-from skin_host.processing.calibration.calibrator import KNOWN_SAMPLES, Calibrator, Known
+from skin_host.processing.calibration.calibrator import (
+    KNOWN_SAMPLES,
+    LONGEST_INTERVAL_NS,
+    Calibrator,
+    Known,
+)
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.intake import PartSample
 from skin_host.processing.masks import Mask, any_of
@@ -14,9 +19,6 @@ from skin_host.processing.masks import Mask, any_of
 #: A calibration takes at least `KNOWN_SAMPLES` of each board, even if that is slow, and the time of
 #: so many conversions, even if less is asked for.
 SHORTEST_S = KNOWN_SAMPLES * CONVERSION_S
-#: A longer interval between two samples of a calibration does not count for its time: nothing was
-#: received, or the clock was set.
-LONGEST_INTERVAL_NS = 1_000_000_000
 
 
 class CalibrationRun:

@@ -92,10 +92,7 @@ def test_presses_that_come_and_go_in_a_calibration_do_not_raise_the_noise_that_i
     sweeps = noisy(np.random.default_rng(6), sweeps=61)
     for first, last, units in ((6, 27, 4), (33, 61, 7)):
         sweeps[first:last, 7:9] -= units
-    calibrator = Calibrator(LAYOUT)
-    for raw in sweeps:
-        calibrator.add(0, raw.astype(np.uint8), PRESENT)
-    found = calibrator.finish("abc", TIME, Known(before, before.baseline, PRESENT))
+    found = recalibrated(before, sweeps)
     assert found.verdict[7] == Verdict.TOUCHED
     assert found.noise[7] == before.noise[7]
 
