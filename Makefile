@@ -44,15 +44,17 @@ test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, systemd, broker
 	@$(BIN)/python -m compileall -q skin_host emulator tests
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target test-real-time test-beside
 
-# What runs in real time, and beside it what computes, which gives way to it, and other machines.
+# What runs in real time, then containers; beside it what computes, which gives way to it, and a
+# Debian: both take as long.
 test-real-time: test-native
 	@tools/timed "on this host: the other tests with a broker" \
 		$(BIN)/python -m pytest tests -m mosquitto --hypothesis-profile=far \
 		--require-mosquitto $(BY_FILE) $(AGAIN)
 	@$(MAKE) --no-print-directory test-lane
+	@$(MAKE) --no-print-directory test-containers
 
 test-beside: test-long
-	@$(MAKE) --no-print-directory test-containers
+	@tools/timed "a Debian that boots: its disk" tools/lane/debian
 	@tools/timed "a Debian that boots: systemd and CAN cards" \
 		$(BIN)/python -m pytest tests/system/systemd --numprocesses=2 --dist=loadfile $(AGAIN)
 
@@ -72,7 +74,6 @@ test-lane: .venv/dev.stamp
 		--bus=vcan --require-mosquitto -o faulthandler_timeout=300 $(AGAIN)
 
 test-containers: .venv/dev.stamp
-	@tools/timed "a Debian that boots: its disk" tools/lane/debian
 	@tools/timed "containers: the image is built, it and the compose file run" \
 		tools/lane/image $(BIN)/python -m pytest tests/system/containers $(AGAIN)
 

@@ -1,11 +1,14 @@
 """A board that was away while the skin became warmer or colder feels what touches it then."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from emulator.probes.scene import Air, Place, Probe, Scene, Temperature
 from tests.support.fault_bench import FaultBench
 
+CONFIGS = Path(__file__).parents[2] / "config"
 CALIBRATED_S = 12.0
 SILENT_S = 240.0
 PART = "left_hand"
@@ -17,8 +20,10 @@ def away(
     before_c: float = 0.0,
     probe: list[Probe] | None = None,
     air: list[Air] | None = None,
+    robot: str = "icub_hand.toml",
+    board: str = PART,
 ) -> FaultBench:
-    """A robot whose hand was not received for some minutes, in which it became warmer.
+    """A hand that was not received for some minutes, in which it became warmer.
 
     It became warmer by `before_c` in as long a time before, which its zeros followed.
     """
@@ -28,10 +33,10 @@ def away(
     scene = Scene(
         temperature=Temperature(keyframes_c=sorted(set(course_c))), probe=probe or [], air=air or []
     )
-    bench = FaultBench(scene=scene)
-    bench.run(lost_s - CALIBRATED_S)
-    mend = bench.inject("board_silent", board="hand")
-    bench.run(SILENT_S)
+    bench = FaultBench(scene=scene, config=CONFIGS / robot)
+    bench.run(lost_s - CALIBRATED_S, look_every=20)
+    mend = bench.inject("board_silent", board=board)
+    bench.run(SILENT_S, look_every=20)
     mend()
     return bench
 
@@ -68,7 +73,7 @@ def test_what_came_on_all_pads_while_it_became_no_warmer_is_no_drift() -> None:
     """All pads read what a few degrees make, but for temperature pads."""
     course = [(0.0, 0.0), (60.0, 6.0), (1000.0, 6.0)]
     air = [Air(part=PART, pressure_kpa=course, start_s=CALIBRATED_S + SILENT_S)]
-    bench = away(0.0, before_c=3.0, air=air)
+    bench = away(0.0, before_c=3.0, air=air, robot="demo.toml", board="hand")
     bench.run(2.0)
     reported_untouched = bench.valid[PART] & ~bench.touched[PART]
     assert np.count_nonzero(reported_untouched) < 50

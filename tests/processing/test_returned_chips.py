@@ -27,7 +27,7 @@ def unread(
     scene = Scene(temperature=Temperature(keyframes_c=course_c), probe=probe or [])
     bench = FaultBench(scene=scene, config=config)
     mend = bench.inject("chip_gone", board="palm", triangle=0)
-    bench.run(unread_s)
+    bench.run(unread_s, look_every=20)
     assert not bench.valid[PART].any()
     mend()
     return bench

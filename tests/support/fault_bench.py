@@ -78,7 +78,7 @@ class FaultBench:
         """Status words of a board's last sweep."""
         return self.sweeps[board].status
 
-    def run(self, seconds: float) -> None:
+    def run(self, seconds: float, *, look_every: int = LOOK_EVERY) -> None:
         for _ in range(round(seconds / TICK_S)):
             self.t_s += TICK_S
             for bus, batch in self.robot.step(TICK_S).items():
@@ -86,7 +86,7 @@ class FaultBench:
                     batch.t_ns[:] += EPOCH_NS - self.robot.t_ns + round(self.t_s * 1e9)
                     self._note(self.engine.feed(bus, batch))
             self._note(self.engine.expire(self.now_ns))
-            if round(self.t_s / TICK_S) % LOOK_EVERY == 0:
+            if round(self.t_s / TICK_S) % look_every == 0:
                 self._look()
 
     def touched_meanwhile(self, part: str, seconds: float) -> list[int]:
