@@ -16,7 +16,7 @@ from skin_host.bus.assembler import Sweep
 from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TRIANGLES, StatusError
 from skin_host.layout import Layout, PadKind
-from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration import Calibration, fineness
 from skin_host.processing.frame import PressureFrame
 from skin_host.processing.glimpses import Glimpses
 from skin_host.processing.intake import Intake, below_zero
@@ -74,6 +74,7 @@ class BoardZeros:
         self.changes = 0
         self.rezeros: dict[int, Rezero] = {}
         self.held: Mask | None = None
+        self._fineness = fineness(layout)
         #: Boards that were silent and may have been zeroed meanwhile.
         self._silent_zeros: dict[int, SilentZero] = {}
         self._returned = ReturnedChips(
@@ -551,6 +552,7 @@ class BoardZeros:
             before,
             read_units,
             (taxels >= 0) & (self._layout.pad_kind[taxels] == PadKind.PRESSURE),
+            self._fineness[taxels],
         )
 
     def _note_unread(self, sweep: Sweep, row: int) -> None:

@@ -69,8 +69,10 @@ DRIFT_S = OWN_UNITS / SLOW_UNITS_PER_S
 #: silence was; in a long one this grows by `SLOW_UNITS_PER_S`, up to a limit.
 COMMON_UNITS = 1.0
 MOST_COMMON_UNITS = 10.0
-#: By this share of what a long silence adds, pads may drift apart: they differ in their foam.
-APART_SHARE = 0.2
+#: By this share of what a long silence adds, pads may drift apart, and by this one of what they
+#: drift together (standard deviations): they differ in their foam.
+APART_SHARE = 0.1
+UNLIKE_SIGMA = 0.3
 #: Without temperature pads a drift is followed up to so many units, as ten degrees make.
 MOST_DRIFTED_UNITS = 5.0
 #: Pads drift alike when they differ from what most do by no more than this share of it, `OWN_UNITS`
@@ -108,10 +110,12 @@ class SilentZero:
         read_units: float64[n], what was read last. The baselines of temperature pads do not follow
             drift. None if there are none of these: all pads measure pressure.
         pressure: bool[n], pads that measure pressure.
+        fineness: float64[n], how many of the units of each taxel are a usual one: noise and drift
+            are as many times larger in finer units. All that is compared is in usual ones.
 
     Attributes:
         silent_s, touched: as given.
-        still_units, read_units: as given, or those of `before`.
+        still_units, read_units: as given, in usual units, or those of `before`.
         unseen_s: the same with all silences since the baseline was known.
         at_start: whether it is infinite.
         clear: whether a zero is so improbable by now, at least one that hides a touch, that the
@@ -132,18 +136,20 @@ class SilentZero:
         before: "SilentZero | None" = None,
         read_units: Floats | None = None,
         pressure: Mask | None = None,
+        fineness: Floats | float = 1.0,
     ) -> None:
-        self._baseline = baseline
-        self._noise = noise
-        self._spread = spread
+        self._fineness = fineness
+        self._baseline = baseline / fineness
+        self._noise = noise / fineness
+        self._spread = spread / fineness
         self._known = known
         self._pressure: Mask = np.ones_like(known) if pressure is None else pressure
         self.touched: Mask = np.zeros_like(known) if touched is None else touched
-        if before is not None:
-            still_units, read_units = before.still_units, before.read_units
         none = np.full(len(known), np.inf)
-        self.still_units: Floats = none if still_units is None else still_units
-        self.read_units: Floats = baseline if read_units is None else read_units
+        self.still_units: Floats = (none if still_units is None else still_units) / fineness
+        self.read_units: Floats = (baseline if read_units is None else read_units) / fineness
+        if before is not None:
+            self.still_units, self.read_units = before.still_units, before.read_units
         self.silent_s = silent_s
         self.unseen_s: float = silent_s + (0.0 if before is None else before.unseen_s)
         self.at_start = math.isinf(self.unseen_s)
@@ -189,7 +195,7 @@ class SilentZero:
             self._first = None
             return None
         self._sweeps += 1
-        units = np.where(present, self._no_load - raw, 0.0)
+        units = np.where(present, self._no_load - raw, 0.0) / self._fineness
         if last_ns is None and not self.at_start:
             self._first = units, present
             return None
@@ -234,7 +240,7 @@ class SilentZero:
         drifted = np.where(self._pressure, common, 0.0)
         shared = max(common, 0.0)
         drifted[seen] = np.where(moved > OWN_UNITS + MOST_SHARE * shared, shared, moved)
-        return drifted
+        return drifted * self._fineness
 
     def _most_drifted(self, received: Mask) -> float:
         """Return how much untouched pads may have risen together, in units.
@@ -331,12 +337,13 @@ def _of_drift(residual: Floats, variance: Floats, drifted_units: float) -> float
     whatever moved them together.
     """
     common_units = _common_units(drifted_units)
-    variance = variance + OWN_UNITS**2 + (APART_SHARE * drifted_units) ** 2
     most = COMMON_SIGMAS * common_units
-    common = np.arange(-most, most + STEP_UNITS, STEP_UNITS)
-    apart = residual - common[:, None]
+    common = np.arange(-most, most + STEP_UNITS, STEP_UNITS)[:, None]
+    own = OWN_UNITS**2 + (APART_SHARE * drifted_units) ** 2 + np.square(UNLIKE_SIGMA * common)
+    variance = variance + own
+    apart = residual - common
     density = np.exp(-0.5 * apart**2 / variance) / np.sqrt(2.0 * np.pi * variance)
     mixed = (1.0 - ELSEWHERE_SHARE) * density + ELSEWHERE_SHARE / RANGE_UNITS
-    of_common = np.log(mixed).sum(axis=1) - 0.5 * np.square(common / common_units)
+    of_common = np.log(mixed).sum(axis=1) - 0.5 * np.square(common[:, 0] / common_units)
     # Wider drifts have more values, each less probable.
     return float(np.logaddexp.reduce(of_common)) - math.log(common_units)

@@ -9,6 +9,7 @@ from emulator.probes.scene import Air, Place, Probe, Scene, Temperature
 from tests.support.fault_bench import FaultBench
 
 CONFIGS = Path(__file__).parents[2] / "config"
+HAND, ROBOT = CONFIGS / "icub_hand.toml", CONFIGS / "demo.toml"
 CALIBRATED_S = 12.0
 SILENT_S = 240.0
 PART = "left_hand"
@@ -20,7 +21,7 @@ def away(
     before_c: float = 0.0,
     probe: list[Probe] | None = None,
     air: list[Air] | None = None,
-    robot: str = "icub_hand.toml",
+    config: Path = HAND,
     board: str = PART,
 ) -> FaultBench:
     """A hand that was not received for some minutes, in which it became warmer.
@@ -33,7 +34,7 @@ def away(
     scene = Scene(
         temperature=Temperature(keyframes_c=sorted(set(course_c))), probe=probe or [], air=air or []
     )
-    bench = FaultBench(scene=scene, config=CONFIGS / robot)
+    bench = FaultBench(scene=scene, config=config)
     bench.run(lost_s - CALIBRATED_S, look_every=20)
     mend = bench.inject("board_silent", board=board)
     bench.run(SILENT_S, look_every=20)
@@ -52,6 +53,17 @@ def test_what_drifted_while_a_board_was_away_is_no_touch(before_c: float, warmer
     assert max(touched) <= 1
     assert touched[-1] == 0
     assert np.count_nonzero(bench.valid[PART]) > 90
+
+
+@pytest.mark.parametrize("shift", [0, 1])
+def test_what_drifted_in_fine_units_is_no_touch_nor_a_zero(shift: int, tmp_path: Path) -> None:
+    """The same warmth is four or eight times as many units as at the hand's usual shift of 3."""
+    fine = tmp_path / "fine.toml"
+    fine.write_text(HAND.read_text().replace("shift = 3", f"shift = {shift}"))
+    bench = away(4.0, config=fine)
+    assert max(bench.touched_meanwhile(PART, 10.0)) == 0
+    assert np.count_nonzero(bench.valid[PART]) > 90
+    assert ("board_rezeroed", PART) not in bench.told
 
 
 def test_what_came_on_some_pads_meanwhile_is_a_touch_of_these() -> None:
@@ -73,7 +85,7 @@ def test_what_came_on_all_pads_while_it_became_no_warmer_is_no_drift() -> None:
     """All pads read what a few degrees make, but for temperature pads."""
     course = [(0.0, 0.0), (60.0, 6.0), (1000.0, 6.0)]
     air = [Air(part=PART, pressure_kpa=course, start_s=CALIBRATED_S + SILENT_S)]
-    bench = away(0.0, before_c=3.0, air=air, robot="demo.toml", board="hand")
+    bench = away(0.0, before_c=3.0, air=air, config=ROBOT, board="hand")
     bench.run(2.0)
     reported_untouched = bench.valid[PART] & ~bench.touched[PART]
     assert np.count_nonzero(reported_untouched) < 50

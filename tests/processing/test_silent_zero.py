@@ -42,16 +42,19 @@ class Skin:
         *,
         common_units: float = 0.0,
         own_units: float = 0.0,
+        unlike: float = 0.0,
         pressed: slice = slice(0),
         press_units: float | NDArray[np.float64] = 20.0,
         silent_s: float = 3.0,
     ) -> tuple[bool | None, float]:
         """Return what is decided, and the evidence, after a silence in which all pads drifted by
-        `common_units`, each by up to `own_units`, and some were pressed.
+        `common_units`, each by up to `own_units` and by a share of the common drift whose standard
+        deviation is `unlike`, and some were pressed.
         """
         n = len(self.noise)
         rest = self.noise * self.rng.standard_normal(n) if zeroed else self.baseline
         rest = rest + common_units + own_units * self.rng.uniform(-1.0, 1.0, n)
+        rest += unlike * common_units * self.rng.standard_normal(n)
         rest = rest + self.slow * self.rng.standard_normal(n)
         rest[pressed] += press_units
         test = SilentZero(
@@ -95,6 +98,27 @@ def test_a_long_silence_in_which_it_became_warmer_is_no_zero(
 ) -> None:
     found, _ = Skin(seed).evidence(False, common_units=common_units, own_units=2.0, silent_s=600.0)
     assert found is False
+
+
+@pytest.mark.parametrize("common_units", [-6.0, -4.0, 4.0, 6.0])
+def test_a_long_silence_in_which_pads_drifted_unlike_is_no_zero(common_units: float) -> None:
+    """The emulated foam's drift differs by half of what the pads share."""
+    found = [
+        Skin(seed).evidence(False, common_units=common_units, unlike=0.5, silent_s=240.0)[0]
+        for seed in range(200)
+    ]
+    assert np.mean(np.array(found, np.bool_)) < 0.1
+
+
+@pytest.mark.parametrize("common_units", [-4.0, 0.0, 4.0])
+def test_nearly_every_zero_in_a_long_silence_is_recognised_as_pads_drift(
+    common_units: float,
+) -> None:
+    found = [
+        Skin(seed).evidence(True, common_units=common_units, unlike=0.5, silent_s=240.0)[0]
+        for seed in range(200)
+    ]
+    assert np.mean(np.array(found, np.bool_)) > 0.98
 
 
 def at_start(seed: int, zeroed: bool, common_units: float, own_units: float) -> bool | None:
