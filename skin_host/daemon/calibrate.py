@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 #: If nothing was received for this long, a calibration ends with what it has.
 GRACE_S = 5.0
 #: A calibration in which a board is zeroed takes longer, so many times.
-MOST_FALLS = 3
+MOST_ZEROED = 3
 #: Where no sample is usable, so many boards are named.
 NAMED_BOARDS = 4
 
@@ -119,34 +119,34 @@ async def collect(
     ledger = engine().ledger
     before_sweeps = ledger.sweeps.copy()
     grown_s = clock.monotonic_s()
-    share, falls = 0.0, 0
+    share, zeroed = 0.0, 0
     while share < 1.0 and clock.monotonic_s() - grown_s < GRACE_S:
         await clock.sleep(0.02)
         before, share = share, engine().calibration_progress()
-        falls += share < before
+        zeroed = engine().calibration_begun_again
         # A board that zeroes itself again and again takes it back every time.
-        if share > before and falls <= MOST_FALLS:
+        if share > before and zeroed <= MOST_ZEROED:
             grown_s = clock.monotonic_s()
         progress(share)
     compute = engine().collected(clock.today().isoformat(timespec="seconds"))
-    if share == 0.0 and not falls:
+    if share == 0.0 and not zeroed:
         now = engine().ledger
         came = now.sweeps > (before_sweeps if now is ledger else 0)
         raise SkinError(f"no calibration: {_why_none(engine(), came)}")
     # Of a large skin this takes a second, in which the boards' frames must be read.
     found = await clock.in_thread(compute)
     if not by_part(found.usable, engine().layout):
-        raise SkinError(f"no calibration: {_why_unusable(found, engine(), falls)}")
+        raise SkinError(f"no calibration: {_why_unusable(found, engine(), zeroed)}")
     return found
 
 
-def _why_unusable(found: Calibration, engine: Engine, falls: int) -> str:
+def _why_unusable(found: Calibration, engine: Engine, zeroed: int) -> str:
     """Return in words why no pad is usable by a calibration.
 
     Args:
         found: the calibration.
         engine: that has collected it.
-        falls: how often boards were zeroed meanwhile.
+        zeroed: how often a board was zeroed meanwhile.
     """
     verdicts = summary(found, engine.layout)
     names = [engine.layout.parts[part].name for part in engine.parts]
@@ -156,10 +156,10 @@ def _why_unusable(found: Calibration, engine: Engine, falls: int) -> str:
     }
     listed = "; ".join(f"{name}: {', '.join(counts)}" for name, counts in counted.items() if counts)
     why = f"no pad is usable by what was received: {listed}"
-    if falls:
+    if zeroed:
         why += (
-            f"; boards were zeroed {falls} times meanwhile, as by a restart: check with "
-            "`skin scan` whether they keep their power"
+            f"; a board was zeroed {zeroed} times meanwhile, as by a restart: check with "
+            "`skin scan` whether it keeps its power"
         )
     return why
 

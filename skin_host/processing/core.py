@@ -295,6 +295,11 @@ class Engine:
         run = self._run
         return 0.0 if run is None or run.is_over else run.progress
 
+    @property
+    def calibration_begun_again(self) -> int:
+        """How often a board that a calibration has samples of was zeroed, of that with the most."""
+        return 0 if self._run is None else max(self._run.begun_again.values(), default=0)
+
     def end_calibration(self, time: str) -> Calibration:
         """Return a calibration from the collected samples and stop collecting.
 

@@ -107,4 +107,4 @@ async def test_of_boards_that_restart_again_and_again_nothing_is_kept(
     why = await why_none(Scene(quiet=True), (), clock, tmp_path, restarting=BOARDS)
     assert "no pad is usable by what was received: left_hand: " in why
     assert "too few" in why
-    assert "times meanwhile, as by a restart: check with `skin scan` whether they keep" in why
+    assert "times meanwhile, as by a restart: check with `skin scan` whether it keeps" in why

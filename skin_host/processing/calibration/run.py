@@ -33,6 +33,7 @@ class CalibrationRun:
     Attributes:
         is_over: the samples have been collected.
         zeroed: the boards that were zeroed since then, and whether touches just before were real.
+        begun_again: by board, how often it was zeroed before, after it had sent samples.
     """
 
     def __init__(self, layout: Layout, calibrator: Calibrator, seconds: float, fewest: int) -> None:
@@ -48,6 +49,7 @@ class CalibrationRun:
         self._samples: dict[tuple[int, int], int] = {}
         self.is_over = False
         self.zeroed: dict[int, bool] = {}
+        self.begun_again: dict[int, int] = {}
 
     @property
     def progress(self) -> float:
@@ -78,16 +80,19 @@ class CalibrationRun:
         """A board has another zero than its samples so far.
 
         A calibration of two zeros would be that of none, and the rest of its time too short for
-        noisy pads.
+        noisy pads. A board that has sent nothing so far takes nothing back: one that is away is set
+        up again and again.
         """
         if self.is_over:
             self.zeroed[board] = believed
             return
+        mine = [sender for sender in self._samples if sender[0] == board]
+        if not any(self._samples[sender] for sender in mine):
+            return
+        self.begun_again[board] = self.begun_again.get(board, 0) + 1
         self.forget(self._layout.taxels_of([board]))
         self._passed_ns = 0
-        for sender in self._samples:
-            if sender[0] == board:
-                self._samples[sender] = 0
+        self._samples.update(dict.fromkeys(mine, 0))
 
     def forget(self, taxels: Mask) -> None:
         """Leave out the samples of taxels, bool[n], so far."""

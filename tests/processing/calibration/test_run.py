@@ -177,6 +177,32 @@ def test_a_board_that_is_zeroed_during_a_calibration_is_calibrated_with_its_new_
     assert np.abs(found.baseline[mine] - (no_load - 239.5)).max() < 1.5
 
 
+def test_boards_that_are_away_take_nothing_back_however_often_they_are_set_up() -> None:
+    settings = load(CONFIG)
+    layout = build_layout(settings, CONFIG.parent)
+    engine = Engine(settings, layout, list(range(len(layout.parts))))
+    away = list(range(1, len(layout.boards)))
+
+    def shift(number: int) -> int:
+        if number % 10 == 5:
+            for board in away:
+                engine.zeros.rezero(board)
+        return 0
+
+    assert sweeps_taken(engine, lambda number: 1.0 + 0.05 * number, shift) < 90
+    assert engine.calibration_begun_again == 0
+
+
+def test_of_a_calibration_it_is_known_how_often_one_board_took_it_back(engine: Engine) -> None:
+    def shift(number: int) -> int:
+        if number in {20, 45}:
+            engine.zeros.rezero(0)
+        return 0
+
+    assert sweeps_taken(engine, lambda number: 1.0 + 0.05 * number, shift) >= 45 + 80
+    assert engine.calibration_begun_again == 2
+
+
 @pytest.mark.parametrize("first", [True, False])
 def test_a_board_that_is_zeroed_while_its_calibration_is_computed_finds_its_zero_anew(
     engine: Engine, first: bool
