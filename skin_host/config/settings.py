@@ -346,7 +346,7 @@ def _triangle(digits: str) -> int:
 
 
 def format_triangles(numbers: list[int]) -> str:
-    """Turn rising numbers such as [0, 1, 2, 3, 4, 8] into "0-4,8", as `parse_triangles` reads."""
+    """Turn numbers such as [0, 1, 2, 3, 4, 8] into "0-4,8", as `parse_triangles` reads."""
     runs = []
     for _, run in groupby(enumerate(numbers), key=lambda item: item[1] - item[0]):
         members = [number for _, number in run]
@@ -585,8 +585,9 @@ def _first_difference(old: Any, new: Any, where: str = "") -> str | None:
 def skin_hash(settings: Settings) -> str:
     """Return a hash of what a calibration belongs to: boards, their set-up, parts and fingertips.
 
-    Twelve hexadecimal digits. Processing, publishing and channel names do not count, so
-    a calibration survives a change of the threshold or a move to another interface.
+    Twelve hexadecimal digits. Processing, publishing, channel names and how lists of triangles are
+    written do not count, so a calibration survives a change of the threshold or a move to another
+    interface.
     """
     boards = {
         name: [board.bus, board.address, board.skin_type, board.no_load]
@@ -594,7 +595,13 @@ def skin_hash(settings: Settings) -> str:
     }
     parts = {
         name: [
-            [patch.board, patch.triangles, patch.kind, patch.shift, patch.cdc_offset]
+            [
+                patch.board,
+                format_triangles(parse_triangles(patch.triangles)),
+                patch.kind,
+                patch.shift,
+                patch.cdc_offset,
+            ]
             for patch in part.patches
         ]
         for name, part in settings.parts.items()

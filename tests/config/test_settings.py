@@ -532,6 +532,15 @@ def test_a_calibration_fits_when_only_the_processing_or_the_channel_changed(
     assert skin_hash(load(same)) == skin_hash(load(DEMO))
 
 
+def test_a_calibration_fits_however_the_same_triangles_are_written(tmp_path: Path) -> None:
+    for text in ("0,1,2-4", "0, 1, 2, 3, 4", "00-04"):
+        same = edited(tmp_path, 'triangles = "0-4"', f'triangles = "{text}"')
+        assert skin_hash(load(same)) == skin_hash(load(DEMO))
+    # Places and the numbers of taxels follow the order.
+    other = edited(tmp_path, 'triangles = "0-4"', 'triangles = "1-4,0"')
+    assert skin_hash(load(other)) != skin_hash(load(DEMO))
+
+
 def test_a_calibration_does_not_fit_other_boards(tmp_path: Path) -> None:
     other = edited(tmp_path, "address = 13", "address = 11")
     assert skin_hash(load(other)) != skin_hash(load(DEMO))
