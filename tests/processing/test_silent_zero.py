@@ -559,3 +559,45 @@ def test_a_board_that_may_have_drifted_is_not_clear_before_all_sweeps() -> None:
             raw = np.rint(NO_LOAD - baseline).astype(np.uint8)
             assert test.step(raw, known, round(sweep * PERIOD_S * 1e9)) is None
         assert test.clear is clear
+
+
+@given(SEEDS, st.sampled_from([0.5, 30.0, 600.0, math.inf]), st.booleans())
+def test_fine_units_are_judged_as_the_same_signals_in_usual_ones(
+    seed: int, silent_s: float, zeroed: bool
+) -> None:
+    """Noise, baselines, drift and what was touched are four times as many units."""
+    no_load, fineness = 128.0, 4.0
+    skin = Skin(seed)
+    touched = np.arange(N) < 4
+    read_units = skin.baseline + skin.rng.standard_normal(N)
+    pressure = np.arange(N) < 40
+
+    def compared(fine: float) -> SilentZero:
+        return SilentZero(
+            *(fine * value for value in (skin.baseline, skin.noise, skin.spread)),
+            skin.known & ~touched,
+            no_load,
+            PERIOD_S,
+            silent_s,
+            touched,
+            np.full(N, fine * 6.0),
+            read_units=fine * read_units,
+            pressure=pressure,
+            fineness=np.full(N, fine),
+        )
+
+    fine, usual = compared(fineness), compared(1.0)
+    rest = np.rint(2.0 + (0.0 if zeroed else 1.0) * skin.baseline + 10.0 * touched)
+    for sweep in range(SWEEPS):
+        units = np.clip(rest + np.rint(skin.noise * skin.rng.standard_normal(N)), -31, 31)
+        t_ns = round(sweep * PERIOD_S * 1e9)
+        raw = [(no_load - scale * units).astype(np.uint8) for scale in (1.0, fineness)]
+        found = usual.step(raw[0], skin.known, t_ns), fine.step(raw[1], skin.known, t_ns)
+        assert found[0] is found[1]
+        assert fine.clear is usual.clear
+    assert fine.evidence() == pytest.approx(usual.evidence())
+    drifted_units = usual.drifted_units()
+    if drifted_units is None:
+        assert fine.drifted_units() is None
+    else:
+        np.testing.assert_allclose(fine.drifted_units(), fineness * drifted_units)
