@@ -281,7 +281,12 @@ class Calibrator:
         verdict[touch.decides > NOISY_MARGINS * margin] = Verdict.NOISY
         verdict[cut_off] = Verdict.SATURATES
         out = ends > SATURATED_SHARE * samples
-        verdict[touched | self._pressed(baseline, counts, ~out)] = Verdict.TOUCHED
+        far = self._pressed(baseline, counts, ~out)
+        if known is not None:
+            # What was untouched and reads no more now is so still, wherever the others rest.
+            rested = known.zeroed & (known.calibration.verdict < Verdict.TOUCHED)
+            far &= ~(rested & (baseline - known.baseline < margin))
+        verdict[touched | far] = Verdict.TOUCHED
         if pressed is not None:
             verdict[pressed] = Verdict.TOUCHED
         verdict[touch.decides > USELESS_MARGINS * margin] = Verdict.TOO_NOISY

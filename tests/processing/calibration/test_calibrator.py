@@ -228,6 +228,26 @@ def test_a_pad_that_rests_far_from_all_others_was_pressed_all_the_time():
     assert found.usable[7]
 
 
+def test_a_pad_that_rests_where_it_did_was_not_pressed_however_far_the_others_are():
+    """They were pressed as their board was zeroed: what presses them now brings them back into the
+    scale, and to a vote.
+    """
+    rng = np.random.default_rng(21)
+    others = np.arange(N) != 7
+    lifted = noisy(rng)
+    lifted[:, others] = 255
+    before = calibrated(lifted)
+    assert before.verdict[7] == Verdict.OK
+    lightly = noisy(rng)
+    lightly[:, others] += 11
+    assert calibrated(lightly).verdict[7] == Verdict.TOUCHED
+    assert recalibrated(before, lightly).verdict[7] == Verdict.OK
+    in_doubt = recalibrated(before, lightly, zeroed=np.zeros(N, np.bool_))
+    assert in_doubt.verdict[7] == Verdict.TOUCHED
+    lightly[:, 7] -= 4
+    assert recalibrated(before, lightly).verdict[7] == Verdict.TOUCHED
+
+
 @pytest.mark.parametrize("seconds", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize("period_s", [0.01, 0.02, 0.05])
 def test_noise_of_real_skin_is_no_press_however_the_zero_caught_it(seconds, period_s):

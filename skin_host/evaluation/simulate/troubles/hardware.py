@@ -10,12 +10,12 @@ from emulator.probes.scene import Fault
 from skin_host.evaluation.simulate.troubles.codes import SWAPPED
 from skin_host.evaluation.simulate.troubles.showing import (
     MOST_NOISE_UNITS,
-    differs_from_a_load,
     is_set_up_unseen,
     longest_chance_s,
     noise_that_shows,
     rests,
     scatters,
+    temperature_shows,
     until_damage_shows_s,
 )
 from skin_host.evaluation.simulate.troubles.trouble import (
@@ -163,8 +163,8 @@ def emulated(
             bound_s, shows = until_damage_shows_s(world, bus, value), rests(world, bus)
         elif name == "jittered_period":
             shows = scatters(world, board)
-        elif name == "temperature_step" and value is not None and value > 0.0:
-            shows = differs_from_a_load(world)
+        elif name == "temperature_step":
+            shows = temperature_shows(world)
         strength = kind.value if value is None else value
         is_sure = (strength is None or abs(strength) >= surely) and bound_s < math.inf
         return Trouble(

@@ -85,14 +85,15 @@ def scatters(world: World, board: str) -> Callable[[], bool]:
     return lambda: sent.scatter_ms(settings.address, since_ns) > sure_ms
 
 
-def differs_from_a_load(world: World) -> Callable[[], bool]:
-    """Return a function: whether readings that rise everywhere can be no load. Temperature pads
-    show that, and pads that are not touched. Where all are, an even load reads the same.
+def temperature_shows(world: World) -> Callable[[], bool]:
+    """Return a function: whether readings that move everywhere can be no load. Temperature pads
+    show that, and pads that are not touched. Where most are, an even load reads the same, and where
+    the zero of most is not known, neither is how far they moved.
     """
     layout = world.layout
     thermal = layout.pad_kind == PadKind.THERMAL
 
-    def differs() -> bool:
+    def shows() -> bool:
         if world.life is None:
             return True
         engine = world.life.daemon.engine
@@ -101,13 +102,14 @@ def differs_from_a_load(world: World) -> Callable[[], bool]:
         usable = engine.calibration.usable & ~thermal
         rests = usable.copy()
         for index, row in engine.ledger.row.items():
+            taxels = layout.boards[index].taxel_index
+            other = (taxels >= 0) & engine.zeros.in_doubt(index)
             felt = engine.intake.touched.get(row)
-            if felt is not None:
-                rests[layout.boards[index].taxel_index[felt]] = False
+            rests[taxels[other if felt is None else other | felt]] = False
         parts = (slice(part.start, part.stop) for part in layout.parts)
         return any(thermal[part].any() or enough_rest(rests[part], usable[part]) for part in parts)
 
-    return differs
+    return shows
 
 
 def until_damage_shows_s(world: World, bus: str, share: float) -> float:
