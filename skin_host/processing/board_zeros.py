@@ -16,7 +16,7 @@ from skin_host.bus.assembler import Sweep
 from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TRIANGLES, StatusError
 from skin_host.layout import Layout, PadKind
-from skin_host.processing.calibration import Calibration, fineness
+from skin_host.processing.calibration import Calibration, Verdict, fineness
 from skin_host.processing.frame import PressureFrame
 from skin_host.processing.glimpses import Glimpses
 from skin_host.processing.intake import Intake, below_zero
@@ -69,6 +69,8 @@ class BoardZeros:
         self._ledger, self._intake = ledger, intake
         self._on_rezero = on_rezero
         self._calibration: Calibration | None = None
+        #: Boards whose zeros the next calibration has measured.
+        self._calibrated: list[int] = []
         self._pipeline: Pipeline | None = None
         self.found = 0
         self.changes = 0
@@ -121,20 +123,38 @@ class BoardZeros:
     def adopt(self, calibration: Calibration, pipeline: Pipeline) -> None:
         """Judge by a calibration, and by the baselines of a pipeline, from now on."""
         self._calibration, self._pipeline = calibration, pipeline
+        if self._calibrated:
+            measured = self._layout.taxels_of(self._calibrated)
+            measured &= calibration.verdict < Verdict.ABSENT
+            if calibration.unchanged is not None:
+                measured &= ~calibration.unchanged
+            self._note_measured(self._calibrated, measured)
+            self._calibrated = []
 
     def calibrated(self, boards: list[int]) -> None:
-        """The zeros of some boards have been measured: they are known."""
+        """The next calibration to be adopted has measured the zeros of some boards, as far as they
+        were received.
+        """
+        self._calibrated = boards
+
+    def _note_measured(self, boards: list[int], measured: Mask) -> None:
+        """The zeros of taxels bool[n] of some boards are known. Of the others nothing has shown
+        what touches them, or what they have drifted by.
+        """
         for board in boards:
+            taxels = self._of(board)
+            mine = measured[taxels] & (taxels >= 0)
+            if not any_of(mine):
+                continue
             self.rezeros.pop(board, None)
             self._silent_zeros.pop(board, None)
-            self._returned.forget(board)
+            self._returned.note_measured(board, np.any(mine, axis=1))
             self._glimpses.forget(board)
             self._wrong.forget(board)
-            self._forget_pressed(board)
+            self._forget_pressed(board, mine)
         self.release(boards)
-        zeroed = self._layout.taxels_of(boards)
-        self._last_touched[zeroed] = self._touched[zeroed]
-        self._touched_before[zeroed] = False
+        self._last_touched[measured] = self._touched[measured]
+        self._touched_before[measured] = False
 
     def note(self, sweep: Sweep, row: int, silent_ns: int) -> None:
         """Take in a sweep of a board.
@@ -158,7 +178,7 @@ class BoardZeros:
         if row in ledger.twice:
             self._note_twice(sweep, row)
             return
-        if ledger.flagged[row] or self._wrong.follows:
+        if ledger.flagged[row] or self._wrong.follows(sweep.board):
             self._note_below_zero(sweep, row)
         if self._wrong.may_be_at_end(sweep):
             self._note_at_end(sweep, row)
@@ -166,17 +186,18 @@ class BoardZeros:
             pressed_zero = self._pressed.get(sweep.board)
             if pressed_zero is not None:
                 self._note_lifted(sweep, row, pressed_zero)
-        if self.rezeros:
-            rezero = self.rezeros.get(sweep.board)
-            if rezero is not None:
-                self._find_zero(sweep, row, rezero)
+        rezero = self.rezeros.get(sweep.board) if self.rezeros else None
+        if rezero is not None and (not rezero.over or sweep.board in self._wrong.below):
+            self._find_zero(sweep, row, rezero)
         if self._silent_zeros:
             silent_zero = self._silent_zeros.get(sweep.board)
             if silent_zero is not None:
                 self._find_silent_zero(sweep, row, silent_zero)
         if sweep.board in self._returned.compared:
             self._compare_chips(sweep, row)
-        if self.rezeros or self._silent_zeros or self._glimpses:
+        rezero = self.rezeros.get(sweep.board) if self.rezeros else None
+        sought = rezero is not None and not rezero.over
+        if sought or sweep.board in self._silent_zeros or sweep.board in self._glimpses:
             self._note_glimpse(sweep, row)
 
     def note_frame(self, index: int, frame: PressureFrame) -> None:
@@ -294,7 +315,9 @@ class BoardZeros:
         self.rezeros[board] = Rezero(
             touched.ravel(), no_load, fitted.ravel(), wanted, period_s, believed
         )
-        self._intake.veto[self._ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
+        # None is valid from its first sweep on. One that sends none goes on by a calibration that
+        # is taken meanwhile, but for what is in doubt.
+        self._intake.veto[self._ledger.row[board]] = touched
         self.changes += 1
         return int(np.count_nonzero(touched))
 
@@ -306,7 +329,8 @@ class BoardZeros:
             if doubted.any():
                 self.rezero(board)
                 if board in self.rezeros:
-                    self.rezeros[board].doubted |= doubted.ravel()
+                    self.rezeros[board].doubt(doubted.ravel())
+                    self._intake.veto[self._ledger.row[board]] = self.in_doubt(board)
 
     def at_risk(self, touched: bool) -> Mask:
         """Return taxels bool[n] whose zero will not be known; with `touched`, also those which are
@@ -427,7 +451,8 @@ class BoardZeros:
         before = self._pressed.get(board)
         if before is not None:
             pressed |= before.pressed
-        self._forget_pressed(board)
+        self._pressed.pop(board, None)
+        self._intake.zeroed_pressed.pop(self._ledger.row[board], None)
         if not any_of(pressed):
             return
         own = self._layout.boards[board].settings
@@ -438,9 +463,14 @@ class BoardZeros:
         self._pressed[board] = PressedZero(pressed, float(own.no_load), noise, repeats)
         self._intake.zeroed_pressed[self._ledger.row[board]] = pressed.reshape(TRIANGLES, PADS)
 
-    def _forget_pressed(self, board: int) -> None:
-        self._pressed.pop(board, None)
-        self._intake.zeroed_pressed.pop(self._ledger.row[board], None)
+    def _forget_pressed(self, board: int, pads: Mask) -> None:
+        """The zeros of pads bool[16, 12] of a board are known, whatever pressed them before."""
+        row = self._ledger.row[board]
+        pressed_zero, explained = self._pressed.get(board), self._intake.zeroed_pressed.get(row)
+        if pressed_zero is not None and pressed_zero.forget(pads.ravel()):
+            del self._pressed[board]
+        if explained is not None:
+            self._intake.zeroed_pressed[row] = explained & ~pads
 
     def _note_lifted(self, sweep: Sweep, row: int, pressed_zero: PressedZero) -> None:
         """See what of that which pressed a board when it was zeroed has lifted."""
@@ -614,6 +644,7 @@ class BoardZeros:
             self._glimpses.forget(sweep.board)
             del self._silent_zeros[sweep.board]
             self.rezero(sweep.board)
+            self._intake.veto[row] = np.ones((TRIANGLES, PADS), np.bool_)
             return
         if silent_zero.at_start:
             return
@@ -671,11 +702,13 @@ class BoardZeros:
 
     def _note_below_zero(self, sweep: Sweep, row: int) -> None:
         """Doubt pads whose zero was taken while something pressed that has lifted now."""
+        ledger, rezero = self._ledger, self.rezeros.get(sweep.board)
         if self._calibration is None:
             return
-        ledger, rezero = self._ledger, self.rezeros.get(sweep.board)
+        far = self._intake.far_of(row)
+        if not any_of(far) and not self._wrong.follows(sweep.board):
+            return
         answered = ledger.answered(row)
-        far = ledger.far[row] & answered[:, None]
         same = self._of_same_chip(sweep, row, far)[:, None]
         below = below_zero(sweep.raw, far) | (same & far & (sweep.raw == END))
         pressed, is_new = np.zeros_like(below), False
@@ -735,15 +768,15 @@ class BoardZeros:
             return
         if sweep.board not in self.rezeros:
             no_load = float(self._layout.boards[sweep.board].settings.no_load)
-            self.rezeros[sweep.board] = Rezero.over(np.full(pads.size, no_load), sweep.t_ns)
-        doubted = self.rezeros[sweep.board].doubted
-        if any_of(pads.ravel() & ~doubted):
-            doubted |= pads.ravel()
+            self.rezeros[sweep.board] = Rezero.of_long_ago(np.full(pads.size, no_load), sweep.t_ns)
+        if self.rezeros[sweep.board].doubt(pads.ravel()):
             self.changes += 1
 
     def _find_zero(self, sweep: Sweep, row: int, rezero: Rezero) -> None:
         if self._pipeline is None or self._calibration is None:
             return
+        if not rezero.begun:
+            self._intake.veto[row] = np.ones((TRIANGLES, PADS), np.bool_)
         ledger = self._ledger
         here = np.repeat(ledger.answered(row), PADS)
         ledger.rezeros[row] += not rezero.begun
@@ -775,4 +808,8 @@ class BoardZeros:
         unsettled = rezero.unsettled(sweep.t_ns)
         if unsettled is not None:
             veto |= unsettled.reshape(TRIANGLES, PADS)
-        self._intake.veto[row] = veto
+        if any_of(veto):
+            self._intake.veto[row] = veto
+        else:
+            self._intake.veto.pop(row, None)
+            rezero.over = unsettled is None

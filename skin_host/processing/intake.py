@@ -408,13 +408,16 @@ class Intake:
     def _pressed_far(self, row: int, sweep: Sweep) -> Mask:
         """Return pads bool[16, 12] of a sweep that are pressed far out of their range."""
         ledger, doubted = self._ledger, self.liveness.doubted
+        far = self.far_of(row)
+        if not self.far_presses.watches(row) and not any_of(far):
+            return far
         trusted = np.repeat(~self.reads_another(row, sweep.raw)[:, None], PADS, axis=1)
         if doubted is not None:
             trusted &= ~doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
         return self.far_presses.step(
             row,
             sweep,
-            ledger.far[row],
+            far,
             trusted,
             self.veto.get(row),
             self.touched.get(row),
@@ -428,13 +431,22 @@ class Intake:
             row: of the board; the ledger has noted its sweep.
             raw: uint8[16, 12], the bytes of that.
         """
-        return lifted(raw, self._unexplained(row))
+        far = self._unexplained(row)
+        return lifted(raw, far) if any_of(far) else np.zeros(TRIANGLES, np.bool_)
+
+    def far_of(self, row: int) -> Mask:
+        """Return pads bool[16, 12] of a board that are far out of range, of chips that answer: the
+        others are so for as long as they do not.
+        """
+        ledger = self._ledger
+        far: Mask = ledger.far[row] & ledger.answered(row)[:, None]
+        return far
 
     def _unexplained(self, row: int) -> Mask:
         """Return pads bool[16, 12] of a board that are far out of range, and were not pressed when
         it was zeroed.
         """
-        far: Mask = self._ledger.far[row]
+        far = self.far_of(row)
         pressed = self.zeroed_pressed.get(row)
         return far if pressed is None else far & ~pressed
 

@@ -212,6 +212,8 @@ class _PartPipeline:
         self.seq = 0
         self._t_ns: int | None = None
         self._elapsed_ns = 0
+        #: For how long nothing of the part has been received.
+        self._unseen_s = 0.0
         #: By how much the clock was set forward and no sweep has shown it yet.
         self._set_ns = 0
         self._no_load = layout.no_load[mine].astype(np.float64)
@@ -352,7 +354,7 @@ class _PartPipeline:
     def step(
         self, raw: NDArray[np.uint8], present: Mask, t_ns: int, pressures: bool
     ) -> PressureFrame:
-        dt_s, gap_s = self._dt_s(t_ns)
+        dt_s = self._dt_s(t_ns)
         raw = raw.copy()
         own = self._own
         if own is not None:
@@ -360,8 +362,14 @@ class _PartPipeline:
             felt = felt if lost is None else felt | lost
             present = own.without_rails(raw, present, self._offset, self._last_raw, felt)
         valid = self._receive(raw, present)
-        if gap_s > 0.0:
-            self._bridge(gap_s)
+        # Nobody knows what presses a part of which nothing is received: its foam waits.
+        foam_s, self._unseen_s = self._unseen_s + dt_s, 0.0
+        if valid is not self._always_valid and not any_of(present):
+            foam_s, self._unseen_s = 0.0, foam_s
+        if foam_s > LONGEST_STEP_S:
+            self._bridge(foam_s - LONGEST_STEP_S)
+            foam_s = LONGEST_STEP_S
+        dt_s = min(dt_s, LONGEST_STEP_S)
         if own is not None and own.erratic.any:
             valid = valid & ~own.erratic.pads
         if any_of(self.drift.returned):
@@ -374,13 +382,13 @@ class _PartPipeline:
         quiet = pressed is touched is self._nowhere and not self._every_sample
         quiet = quiet and not (self._felt.residuals.any or self._called.residuals.any)
         windows = self._windows
-        if quiet and not pressures and not windows.due(dt_s):
-            windows.skip(self._last_raw, dt_s)
+        if quiet and not pressures and not windows.due(foam_s):
+            windows.skip(self._last_raw, foam_s)
             return self._frame(t_ns, raw, valid, self._zeros, self._nowhere, self._nowhere, False)
         cut_off = 255 in self._last_raw.tobytes()
         beyond = self._beyond(cut_off) if cut_off or not (idle and quiet) else self._nowhere
-        corrected, pressure = self._pressures(beyond, pressed, windows.unseen_s + dt_s)
-        over = windows.add(self._last_raw, dt_s, self._kpa_per_unit if quiet else None)
+        corrected, pressure = self._pressures(beyond, pressed, windows.unseen_s + foam_s)
+        over = windows.add(self._last_raw, foam_s, self._kpa_per_unit if quiet else None)
         if pressed is not self._noted:
             np.logical_or(self._was_touched, pressed, out=self._was_touched)
             self._noted = pressed
@@ -391,7 +399,7 @@ class _PartPipeline:
             found = []
             for one, its in zip(self._decisions, decided, strict=True):
                 if beyond is not self._nowhere:
-                    one.residuals.press_beyond(beyond & its, self._last_raw == 0, dt_s)
+                    one.residuals.press_beyond(beyond & its, self._last_raw == 0, foam_s)
                 found.append(one.report(its, corrected, relaxation_kpa, idle))
             pressed, touched = found[0], found[-1]
         if valid is not self._always_valid:
@@ -472,19 +480,18 @@ class _PartPipeline:
             self._elapsed_ns,
         )
 
-    def _dt_s(self, t_ns: int) -> tuple[float, float]:
-        """Return the step to this sweep, and the time before it that is a gap."""
+    def _dt_s(self, t_ns: int) -> float:
+        """Return the time since the sample before."""
         last, self._t_ns = self._t_ns, t_ns
         if last is None:
-            return 0.0, 0.0
+            return 0.0
         passed_ns = t_ns - last
         if 0 < self._set_ns <= passed_ns:
             passed_ns -= self._set_ns
             self._set_ns = 0
         passed_ns = max(passed_ns, 0)
         self._elapsed_ns += passed_ns
-        dt_s = passed_ns * 1e-9
-        return min(dt_s, LONGEST_STEP_S), max(dt_s - LONGEST_STEP_S, 0.0)
+        return passed_ns * 1e-9
 
     def _bridge(self, gap_s: float) -> None:
         """Advance the foam's model through a gap, under the readings after it."""

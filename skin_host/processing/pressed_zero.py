@@ -68,3 +68,9 @@ class PressedZero:
         self.lifted ^= turned
         self._other[turned] = 0
         return True
+
+    def forget(self, pads: Mask) -> bool:
+        """The zeros of some pads, bool[n], are known; return whether those of all are."""
+        self.pressed &= ~pads
+        self.lifted &= ~pads
+        return not any_of(self.pressed | self.lifted)

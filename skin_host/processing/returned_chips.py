@@ -109,7 +109,16 @@ class ReturnedChips:
             drifted_units[~np.repeat(known, len(here) // TRIANGLES)] = 0.0
         return triangles & ~known, drifted_units
 
+    def note_measured(self, board: int, triangles: Mask) -> None:
+        """The zeros of some triangles, bool[16], of a board have been measured. The others have
+        drifted since they were read last.
+        """
+        self.compared.pop(board, None)
+        since_ns = self._since_ns.get(board)
+        if since_ns is not None:
+            since_ns[triangles] = _KNOWN_NS
+
     def forget(self, board: int) -> None:
-        """Compare no triangles of a board any more: its zero is sought, or was measured."""
+        """Compare no triangles of a board any more: its zero is sought."""
         self.compared.pop(board, None)
         self._since_ns.pop(board, None)

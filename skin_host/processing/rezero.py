@@ -110,6 +110,7 @@ class Rezero:
         cut_off: bool[n], taxels whose noise reaches the end of the scale: they are refused.
         moved: bool[n], taxels that something may have pressed while they were observed: they are
             observed again.
+        over: whether all zeros have been found, are in use and in no doubt: no sweep changes that.
     """
 
     def __init__(
@@ -122,6 +123,7 @@ class Rezero:
         believed: bool = True,
     ) -> None:
         self.believed = believed
+        self.over = False
         self._no_load = no_load
         self._repeats = repeats_of(period_s)
         none = np.zeros(len(no_load), np.int64)
@@ -152,8 +154,16 @@ class Rezero:
         self._n_far = np.zeros(n, np.int64)
         self._n_end = np.zeros(n, np.int64)
 
+    def doubt(self, pads: Mask) -> bool:
+        """The zeros of some pads, bool[n], are not known; return whether any of them was."""
+        if not np.any(pads & ~self.doubted):
+            return False
+        self.doubted |= pads
+        self.over = False
+        return True
+
     @classmethod
-    def over(cls, no_load: Floats, t_ns: int) -> "Rezero":
+    def of_long_ago(cls, no_load: Floats, t_ns: int) -> "Rezero":
         """Return one whose zero has long been in use, at a time: only doubts can still arise."""
         none = np.zeros(len(no_load), np.bool_)
         rezero = cls(none, no_load, none)

@@ -229,14 +229,17 @@ class SilentZero:
         seen = self._known & self._pressure & received
         if not self._drifts or self.at_start or np.count_nonzero(seen) < REFERENCES:
             return None
-        mean, variance = self._mean_of(seen)
-        moved = mean - self._baseline[seen]
-        common = float(np.median(moved))
+        of_all = seen | (self.touched & self._pressure & received)
+        mean, variance = self._mean_of(of_all)
+        moved = mean - self._baseline[of_all]
+        untouched = seen[of_all]
+        common = float(np.median(moved[untouched]))
         apart = OWN_UNITS + UNLIKE_SHARE * abs(common) + ALIKE_SIGMAS * np.sqrt(variance)
+        # What touched a pad before has lifted where it reads what the untouched ones do.
         alike = np.abs(moved - common) < apart
-        of_all = np.count_nonzero(seen | (self.touched & self._pressure & received))
-        if np.count_nonzero(alike) < ALIKE_SHARE * of_all or common > self._most_drifted(received):
+        if np.mean(alike) < ALIKE_SHARE or common > self._most_drifted(received):
             return None
+        moved = moved[untouched]
         drifted = np.where(self._pressure, common, 0.0)
         shared = max(common, 0.0)
         drifted[seen] = np.where(moved > OWN_UNITS + MOST_SHARE * shared, shared, moved)

@@ -60,10 +60,11 @@ class WrongZeros:
         """A board has a new zero: what rested at the end of its scale may do so no more."""
         self._at_end.pop(board, None)
 
-    @property
-    def follows(self) -> bool:
-        """Return whether `note_below` and `note_resting` have anything to do with any sweep."""
-        return bool(self.below or self._others_rest)
+    def follows(self, board: int) -> bool:
+        """Return whether `note_below` and `note_resting` have anything to do with a board's sweep
+        without far pads.
+        """
+        return board in self.below or board in self._others_rest
 
     def may_be_at_end(self, sweep: Sweep) -> bool:
         """Return whether `note_at_end` has anything to do with a sweep."""

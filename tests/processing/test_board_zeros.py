@@ -556,8 +556,9 @@ def test_a_new_zero_is_not_that_of_two_if_the_board_was_silent_while_it_was_soug
     expect_new_zeros(hand, steps)
 
 
-def test_a_calibration_after_a_silence_decides_by_itself(worn: tuple[Hand, list[Step]]) -> None:
-    """The zero before it does not matter any more."""
+def test_a_calibration_of_too_few_sweeps_does_not_show_whether_a_board_was_zeroed(
+    worn: tuple[Hand, list[Step]],
+) -> None:
     hand, _ = worn
     hand.pause(3.0)
     hand.rests_elsewhere(seed=2)
@@ -566,7 +567,7 @@ def test_a_calibration_after_a_silence_decides_by_itself(worn: tuple[Hand, list[
     hand.send(SWEEPS - 6)
     hand.engine.use(hand.engine.end_calibration("2026-01-01T00:00:00+00:00"))
     hand.send(20)
-    assert hand.engine.ledger.rezeros.tolist() == [0]
+    assert hand.engine.ledger.rezeros.tolist() == [1]
 
 
 def test_a_calibration_takes_of_pads_in_doubt_only_what_comes_after_a_silence_is_judged(
@@ -628,6 +629,21 @@ def test_a_calibration_takes_nothing_of_two_boards_at_one_address(
     assert (found.unchanged | ~found.usable).all()
     assert not (found.unchanged & ~known).any()
     assert valid_share(steps[-1]) == 0.0
+
+
+def test_nothing_is_asked_of_a_board_whose_new_zero_is_known_until_a_pad_is_in_doubt(
+    hand: Hand,
+) -> None:
+    hand.engine.zeros.rezero(0)
+    hand.send(20)
+    assert not hand.engine.zeros.rezeros[0].over
+    assert hand.engine.intake.veto
+    hand.send(60)
+    assert hand.engine.zeros.rezeros[0].over
+    assert not hand.engine.intake.veto
+    hand.send(200, p3=255)
+    assert hand.in_doubt == [3]
+    assert hand.engine.intake.veto[0].sum() == 1
 
 
 def test_what_touched_pads_read_after_a_silence_shows_no_zero(hand: Hand) -> None:

@@ -55,6 +55,29 @@ def test_what_drifted_while_a_board_was_away_is_no_touch(before_c: float, warmer
     assert np.count_nonzero(bench.valid[PART]) > 90
 
 
+@pytest.mark.parametrize(
+    ("fault", "silent_s"), [("board_silent", 60.0), ("board_silent", 600.0), ("chip_gone", 60.0)]
+)
+def test_a_part_that_was_released_while_it_was_away_rests_as_before(
+    fault: str, silent_s: float
+) -> None:
+    """Its foam recovers meanwhile. As if it were still pressed, the model took 10 kPa too much off
+    what it read afterwards: the zeros fell by 3 units, then all pads seemed to come back.
+    """
+    part, kpa = "left_finger", [(0.0, 0.0), (0.5, 50.0), (10.5, 50.0), (11.5, 0.0)]
+    air = [Air(part=part, pressure_kpa=kpa, start_s=CALIBRATED_S)]
+    bench = FaultBench(scene=Scene(air=air), config=CONFIGS / "gripper.toml")
+    bench.run(8.0)
+    assert bench.touched[part].all()
+    triangle = {"triangle": 0} if fault == "chip_gone" else {}
+    mend = bench.inject(fault, board="palm", **triangle)
+    bench.run(silent_s, look_every=20)
+    mend()
+    bench.run(25.0)
+    assert bench.valid[part].all()
+    assert not bench.touched[part].any()
+
+
 @pytest.mark.parametrize("shift", [0, 1])
 def test_what_drifted_in_fine_units_is_no_touch_nor_a_zero(shift: int, tmp_path: Path) -> None:
     """The same warmth is four or eight times as many units as at the hand's usual shift of 3."""
@@ -89,3 +112,19 @@ def test_what_came_on_all_pads_while_it_became_no_warmer_is_no_drift() -> None:
     bench.run(2.0)
     reported_untouched = bench.valid[PART] & ~bench.touched[PART]
     assert np.count_nonzero(reported_untouched) < 50
+
+
+def test_a_board_that_is_set_up_in_vain_goes_on_by_a_calibration_of_the_others() -> None:
+    """Nothing is known of its pads but what was before; its new zero shows when it is back."""
+    bench = FaultBench(config=ROBOT)
+    mend = bench.inject("board_silent", board="hand")
+    bench.run(5.0)
+    bench.engine.zeros.rezero(0)
+    bench.calibrate(5.0)
+    mend()
+    bench.engine.zeros.rezero(0)
+    bench.robot.bring_up()
+    bench.run(0.5)
+    assert not bench.valid[PART].any()
+    assert max(bench.touched_meanwhile(PART, 10.0)) == 0
+    assert np.count_nonzero(bench.valid[PART]) > 90

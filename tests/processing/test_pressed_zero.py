@@ -75,3 +75,11 @@ def test_what_the_noise_of_the_zero_explains_is_no_release(
     assert found.pressed.tolist() == [True, True, False]
     send(found, BELOW_SWEEPS, lowest - 1, 0, 0)
     assert found.lifted.tolist() == [True, False, False]
+
+
+def test_a_calibration_of_some_pads_shows_nothing_of_the_others() -> None:
+    found = zero()
+    assert not found.forget(np.array([True, False, True]))
+    assert found.pressed.tolist() == [False, True, False]
+    assert found.forget(~np.array([True, False, True]))
+    assert not found.pressed.any()

@@ -81,3 +81,50 @@ def test_a_chip_that_comes_back_soon_is_read_at_once() -> None:
     bench = unread(0.5, unread_s=20.0)
     bench.run(0.3)
     assert bench.valid[PART].all()
+
+
+def test_a_calibration_without_a_chip_does_not_show_what_its_pads_drifted_by() -> None:
+    """They go on as before, so that they are touched if that is not noticed."""
+    course_c = [(CALIBRATED_S, 25.0), (CALIBRATED_S + UNREAD_S, 27.0)]
+    scene = Scene(temperature=Temperature(keyframes_c=course_c))
+    bench = FaultBench(scene=scene, config=GRIPPER)
+    mend = bench.inject("chip_gone", board="palm", triangle=0)
+    bench.run(UNREAD_S - 20.0, look_every=20)
+    bench.calibrate(5.0)
+    bench.run(14.7)
+    mend()
+    assert max(bench.touched_meanwhile(PART, 10.0)) == 0
+    assert np.count_nonzero(bench.valid[PART]) == 12
+
+
+def test_a_calibration_without_a_chip_does_not_show_that_its_pads_are_released() -> None:
+    """A restart of the board would hide the press for as long as it lasts."""
+    press = Probe(
+        part=PART,
+        at=Place(triangle=0),
+        diameter_mm=6,
+        force_n=[(0.0, 0.0), (1.0, 2.0), (1000.0, 2.0)],
+        start_s=CALIBRATED_S,
+    )
+    bench = FaultBench(scene=Scene(quiet=True, probe=[press]), config=GRIPPER)
+    bench.run(5.0)
+    touched = bench.touched[PART]
+    assert touched.any()
+    mend = bench.inject("chip_gone", board="palm", triangle=0)
+    bench.calibrate(5.0)
+    mend()
+    bench.engine.zeros.rezero(0)
+    bench.robot.bring_up()
+    bench.run(5.0)
+    assert not bench.valid[PART][touched].any()
+    bench.calibrate(5.0)
+    bench.run(1.0)
+    assert ("taxel_pressed", PART) in bench.told
+
+
+def test_pads_of_a_chip_that_does_not_answer_are_not_compared_with_far_presses() -> None:
+    """A chip may be gone for years: each sweep would take three times as long."""
+    bench = FaultBench(config=GRIPPER, settle_s=0.5)
+    bench.inject("chip_gone", board="palm", triangle=0)
+    bench.run(1.0)
+    assert not bench.engine.intake.far_presses.watches(0)

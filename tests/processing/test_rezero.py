@@ -196,7 +196,7 @@ def test_new_baselines_are_unsettled_until_the_pipeline_uses_them() -> None:
 
 def test_a_zero_that_has_long_been_in_use_is_settled_and_in_no_doubt() -> None:
     t_ns = 1_700_000_000 * S
-    rezero = Rezero.over(NO_LOAD, t_ns)
+    rezero = Rezero.of_long_ago(NO_LOAD, t_ns)
     assert rezero.begun
     for passed_ns in (0, SETTLE_NS, 100 * S):
         assert rezero.settled(t_ns + passed_ns)

@@ -481,6 +481,7 @@ def drifted(
     silent_s: float,
     warm_units: float | None = None,
     noise: float = 0.5,
+    touched: slice = slice(0),
 ) -> NDArray[np.float64] | None:
     """Return by how much pads that moved so far are taken to have drifted in a silence.
 
@@ -489,6 +490,7 @@ def drifted(
         silent_s: how long it was.
         warm_units: by how much six temperature pads moved; without it there are none.
         noise: of all.
+        touched: those that something touched before.
     """
     n_warm = 0 if warm_units is None else 6
     n = len(moved_units) + n_warm
@@ -497,14 +499,15 @@ def drifted(
     baseline = rng.uniform(-1.0, 1.0, n)
     spread = np.full(n, noise)
     pressure = np.arange(n) < len(moved_units)
-    known = np.ones(n, np.bool_)
+    before = np.zeros(n, np.bool_)
+    before[touched] = True
     test = SilentZero(
-        baseline, spread, spread, known, NO_LOAD, PERIOD_S, silent_s, pressure=pressure
+        baseline, spread, spread, ~before, NO_LOAD, PERIOD_S, silent_s, before, pressure=pressure
     )
     for sweep in range(SWEEPS):
         raw = np.rint(NO_LOAD - baseline - moved - noise * rng.standard_normal(n))
         t_ns = round(sweep * PERIOD_S * 1e9)
-        test.step(np.clip(raw, 0, 255).astype(np.uint8), known, t_ns)
+        test.step(np.clip(raw, 0, 255).astype(np.uint8), np.ones(n, np.bool_), t_ns)
     return test.drifted_units()
 
 
@@ -517,6 +520,18 @@ def test_each_pad_has_drifted_by_what_it_reads_after_a_long_silence(
     found = drifted(moved, silent_s)
     assert found is not None
     np.testing.assert_allclose(found, moved, atol=1.0)
+
+
+@given(MINUTES)
+def test_pads_that_were_touched_and_read_what_the_others_do_have_drifted(silent_s: float) -> None:
+    found = drifted(np.full(40, 1.5), silent_s, touched=slice(20))
+    assert found is not None
+    np.testing.assert_allclose(found, 1.5, atol=1.0)
+
+
+@given(MINUTES)
+def test_no_drift_is_known_where_much_that_was_touched_still_is(silent_s: float) -> None:
+    assert drifted(np.repeat([8.0, 1.5], 20), silent_s, touched=slice(20)) is None
 
 
 @given(MINUTES)

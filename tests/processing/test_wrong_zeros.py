@@ -138,6 +138,6 @@ def test_a_triangle_is_of_the_same_chip_once_its_others_have_rested_in_sweeps_in
     # What was not received counts neither way, and what rests no more begins again.
     assert zeros.note_resting(0, ALL & here, here).sum() == TRIANGLES - 1
     assert zeros.note_resting(0, ALL, ALL).all()
-    assert zeros.follows
+    assert zeros.follows(0)
     assert not zeros.note_resting(0, ~ALL, ALL).any()
-    assert not zeros.follows
+    assert not zeros.follows(0)

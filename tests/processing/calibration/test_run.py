@@ -214,7 +214,10 @@ def test_a_board_that_is_zeroed_while_its_calibration_is_computed_finds_its_zero
     compute = engine.collected("2026-01-01T00:00:00+00:00")
     engine.zeros.rezero(0)
     engine.use(compute())
+    bus = engine.layout.boards[0].settings.bus
+    found = engine.feed(bus, sweep_of(engine, 0, np.random.default_rng(5), 20_000_000_000))
     assert engine.intake.veto[0].all()
+    assert not any(frame.valid.any() for frame in found.frames)
 
 
 def test_a_pad_of_which_too_little_was_received_is_as_noisy_as_it_is_in_the_next_calibration(
