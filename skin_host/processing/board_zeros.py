@@ -69,8 +69,6 @@ class BoardZeros:
         self._ledger, self._intake = ledger, intake
         self._on_rezero = on_rezero
         self._calibration: Calibration | None = None
-        #: Boards whose zeros the next calibration has measured.
-        self._calibrated: list[int] = []
         self._pipeline: Pipeline | None = None
         self.found = 0
         self.changes = 0
@@ -123,24 +121,15 @@ class BoardZeros:
     def adopt(self, calibration: Calibration, pipeline: Pipeline) -> None:
         """Judge by a calibration, and by the baselines of a pipeline, from now on."""
         self._calibration, self._pipeline = calibration, pipeline
-        if self._calibrated:
-            measured = self._layout.taxels_of(self._calibrated)
-            measured &= calibration.verdict < Verdict.ABSENT
-            if calibration.unchanged is not None:
-                measured &= ~calibration.unchanged
-            self._note_measured(self._calibrated, measured)
-            self._calibrated = []
 
-    def calibrated(self, boards: list[int]) -> None:
-        """The next calibration to be adopted has measured the zeros of some boards, as far as they
-        were received.
+    def calibrated(self, calibration: Calibration, boards: list[int]) -> None:
+        """A calibration, adopted next, has measured the zeros of some boards, as far as they were
+        received: those are known. Of the others nothing has shown what touches them, or what they
+        have drifted by.
         """
-        self._calibrated = boards
-
-    def _note_measured(self, boards: list[int], measured: Mask) -> None:
-        """The zeros of taxels bool[n] of some boards are known. Of the others nothing has shown
-        what touches them, or what they have drifted by.
-        """
+        measured = self._layout.taxels_of(boards) & (calibration.verdict < Verdict.ABSENT)
+        if calibration.unchanged is not None:
+            measured &= ~calibration.unchanged
         for board in boards:
             taxels = self._of(board)
             mine = measured[taxels] & (taxels >= 0)
@@ -186,7 +175,7 @@ class BoardZeros:
             pressed_zero = self._pressed.get(sweep.board)
             if pressed_zero is not None:
                 self._note_lifted(sweep, row, pressed_zero)
-        rezero = self.rezeros.get(sweep.board) if self.rezeros else None
+        rezero = self.rezeros.get(sweep.board)
         if rezero is not None and (not rezero.over or sweep.board in self._wrong.below):
             self._find_zero(sweep, row, rezero)
         if self._silent_zeros:
@@ -195,7 +184,7 @@ class BoardZeros:
                 self._find_silent_zero(sweep, row, silent_zero)
         if sweep.board in self._returned.compared:
             self._compare_chips(sweep, row)
-        rezero = self.rezeros.get(sweep.board) if self.rezeros else None
+        rezero = self.rezeros.get(sweep.board)
         sought = rezero is not None and not rezero.over
         if sought or sweep.board in self._silent_zeros or sweep.board in self._glimpses:
             self._note_glimpse(sweep, row)

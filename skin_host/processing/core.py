@@ -243,7 +243,7 @@ class Engine:
         self.intake.use(noise, np.isin(self.boards, boards), pressed)
         if self.fingertips is not None and boards == self.boards:
             self._ended += self.fingertips.use(calibration.zeros)
-        self.zeros.calibrated(boards)
+        self.zeros.calibrated(calibration, boards)
         zeroed = self.layout.taxels_of(boards)
         self._renew_pipeline(zeroed)
         for part in self.parts:

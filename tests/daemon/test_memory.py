@@ -560,7 +560,9 @@ RUNS = st.lists(
 
 @given(runs=RUNS)
 @settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=settings().max_examples // 2,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 def test_whichever_nodes_had_the_parts_each_is_known_as_it_is(
     tmp_path_factory: pytest.TempPathFactory, runs: list[tuple[int, list[tuple[str, str, int]]]]
