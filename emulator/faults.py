@@ -727,7 +727,7 @@ KINDS: dict[str, Kind] = {
         "a node fills the bus with identifier 0; value: share of the bus",
         ("bus",),
         _babbling_node,
-        0.9,
+        1.0,
         bounds=(0, 1),
     ),
     "temperature_step": Kind(

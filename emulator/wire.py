@@ -1,5 +1,6 @@
 """One CAN bus: who sends when. Frames wait for the bus, the lowest identifier goes first.
 
+A frame whose transmission has begun is not interrupted (ISO 11898-1: arbitration is at its start).
 Boards have short queues. What does not fit is lost: an MTB4 drops the newest frames, an MTB3
 drops its whole stack and reports that.
 """
@@ -203,9 +204,9 @@ class Wire:
     def _arbitrate(self, group: FrameBatch, ready_ns: int) -> None:
         """Find out when these frames, and those that they delay, are transmitted."""
         under_way = self._under_way
-        n = _ended(under_way, ready_ns)
-        ended, backlog = _split(under_way, n)
-        free_ns = int(ended.t_ns[-1]) if n else self._free_ns
+        n = self._begun(under_way, ready_ns)
+        begun, backlog = _split(under_way, n)
+        free_ns = int(begun.t_ns[-1]) if n else self._free_ns
         group = self._admit(backlog, group)
         known = self._passed.get(id(group.id))
         if known is not None and known[0] is group.id and known[1] is group.dlc:
@@ -223,7 +224,15 @@ class Wire:
                     self._passed.clear()
                 self._passed[id(group.id)] = group.id, group.dlc, passed_ns
         group.t_ns = max(free_ns, ready_ns) + passed_ns
-        self._under_way = join([ended, group]) if n else group
+        self._under_way = join([begun, group]) if n else group
+
+    def _begun(self, under_way: FrameBatch, t_ns: int) -> int:
+        """How many of the frames have been transmitted by `t_ns`, the one that is then included."""
+        n = _ended(under_way, t_ns)
+        if n == len(under_way):
+            return n
+        bits = OVERHEAD_BITS + STUFF_BITS + 8 * int(under_way.dlc[n])
+        return n + (int(under_way.t_ns[n]) - round(bits * self._bit_ns) < t_ns)
 
     def _let_first(self, urgent: FrameBatch) -> None:
         """Do what `_arbitrate` does for frames of the highest priority, ready one after the other.
@@ -237,7 +246,7 @@ class Wire:
         bits = (OVERHEAD_BITS + STUFF_BITS + 8 * both.dlc.astype(np.int64)).tolist()
         is_urgent = (both.id >> 4 == 0).tolist()
         ready_ns = urgent.t_ns.tolist()
-        n = _ended(under_way, ready_ns[0])
+        n = self._begun(under_way, ready_ns[0])
         order = list(range(n))
         ends_ns: list[int] = under_way.t_ns[:n].tolist()
         free_ns = ends_ns[-1] if n else self._free_ns
@@ -251,16 +260,13 @@ class Wire:
             left.insert(waits, number)
             waits += 1
             begin_ns = max(free_ns, now_ns)
-            passed_bits = 0
-            while left:
+            passed_bits, free_ns = 0, begin_ns
+            while left and free_ns < next_ns:
                 passed_bits += bits[left[0]]
-                end_ns = begin_ns + round(passed_bits * self._bit_ns)
-                if end_ns > next_ns:
-                    break
+                free_ns = begin_ns + round(passed_bits * self._bit_ns)
                 order.append(left.popleft())
-                ends_ns.append(end_ns)
+                ends_ns.append(free_ns)
                 waits -= waits > 0
-                free_ns = end_ns
         rows = np.array(order, np.intp)
         self._under_way = FrameBatch(
             both.id[rows], both.dlc[rows], both.data[rows], np.array(ends_ns, np.int64)

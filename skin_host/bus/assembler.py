@@ -128,6 +128,8 @@ class _BoardState:
         usual: that of the last sweep of which no half was missing; 0 while there is none.
         lasted_ns: how long the last such sweep lasted whose frames were not taken together.
         amid: whether the sweep began with another half than the usual one.
+        is_rest: whether it may be the end of the sweep before, of which nothing came that is sent
+            later than the half with which it began.
     """
 
     index: int
@@ -157,6 +159,7 @@ class _BoardState:
     usual: int = 0
     lasted_ns: int = 0
     amid: bool = False
+    is_rest: bool = False
 
     def unpack(self) -> None:
         """Take the payloads of the frames in `begun`."""
@@ -453,7 +456,7 @@ class Assembler:
             if not done:
                 self._close_old(first_ns, sweeps)
                 state.first_ns = first_ns
-                state.first, state.amid = order.first, False
+                state.first, state.amid, state.is_rest = order.first, False, False
                 state.certain_until_ns = first_ns + periods.sure_ns
             done += n
             state.begun += text[begin:]
@@ -542,7 +545,10 @@ class Assembler:
         came = state.awaited & ~state.missing if state.missing else 0
         # That lacks them all: those that came may be late ones of the sweep before.
         late = state.amid and came and not came & state.sent
-        begins = late and self._begins_after_late(state, came, bit, t_ns)
+        begins = late and (
+            (state.is_rest and bit & (state.usual | state.sent) != 0)
+            or self._begins_after_late(state, came, bit, t_ns)
+        )
         if (
             came.bit_count() == 1
             and max(periods.last_ns, periods.before_ns) <= t_ns < state.first_ns
@@ -581,9 +587,13 @@ class Assembler:
             state.missing = state.awaited
             state.first_ns = t_ns
             state.first, state.amid = bit, state.usual not in (0, bit)
+            state.is_rest = state.amid and state.order.ends(bit, state.sent)
             self._expect_order(state)
         ends_ns = periods.ends_ns(state.first_ns, t_ns)
-        if state.amid:
+        if state.is_rest:
+            # Any frame may begin the next one.
+            ends_ns = state.first_ns - 1
+        elif state.amid:
             # Until then the usual first frame begins no other.
             came = state.awaited & ~state.missing | bit
             ends_ns = min(ends_ns, state.first_ns + periods.slowest_ns(came.bit_count()))

@@ -133,11 +133,13 @@ class BoardOrder:
         known: the order, once it is learnt.
         stray: sweeps in succession with frames in another order.
         learn_after: so many sweeps pass before the order is learnt.
+        learnt: the order that was known last.
     """
 
     known: Order | None = None
     stray: int = 0
     learn_after: int = 1
+    learnt: Order | None = None
 
     def begin_sweep(self) -> bool:
         """Note that a sweep begins while no order is known; return whether it may show it."""
@@ -156,8 +158,21 @@ class BoardOrder:
         if len(came) < SHORTEST_RUN or any(head[_DLC_AT] < 8 for head, _, _ in came):
             self.learn_after = _LEARN_AFTER_SWEEPS
         else:
-            self.known = Order.of(came)
+            self.known = self.learnt = Order.of(came)
         return self.known
+
+    def ends(self, bit: int, sent: int) -> bool:
+        """Return whether a half, in the order that was learnt last, comes after all of some others.
+
+        Args:
+            bit: of the half.
+            sent: mask of the others.
+        """
+        if self.learnt is None:
+            return False
+        # As many were missing when it was the next.
+        missing = min(missing for missing in self.learnt.missing if missing & bit)
+        return not sent & missing
 
     def note_stray(self) -> None:
         """Note that a sweep did not come in the known order; too many in succession end that."""

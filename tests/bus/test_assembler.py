@@ -145,6 +145,34 @@ def test_a_late_frame_joins_no_sweep_of_which_the_first_frame_is_late_or_lost(
     assert counters.late == counters.missed == 0
 
 
+@pytest.mark.parametrize("at_once", [1, 3, 1000])
+@pytest.mark.parametrize("cut", [1, 2, 5, 6, 7])
+@pytest.mark.parametrize("come", [1, 2, 7])
+def test_the_rest_of_a_sweep_that_a_full_bus_held_up_joins_no_sweep_that_follows_at_once(
+    at_once: int, cut: int, come: int
+) -> None:
+    """More urgent boards had the bus in its middle, and of its end only some fitted the queue."""
+    assembler = make()
+    sent: list[tuple[int, bytes, int]] = []
+    for number in range(1, 60):
+        swept = frames(values(4, number), number * PERIOD)
+        if number > 4:
+            ends_ns = (number + 1) * PERIOD - 60_000
+            rest = [
+                (*frame[:2], ends_ns - 116_000 * (7 - place)) for place, frame in enumerate(swept)
+            ]
+            swept[cut:] = rest[cut : cut + come]
+        sent += swept
+    sweeps = feed_in_parts(assembler, sent, at_once)
+    sweeps += assembler.flush()
+    for sweep in sweeps:
+        has_nothing_else(sweep, values(4, sweep.t_ns // PERIOD))
+    counters = assembler.counters
+    used = 2 * sum(sweep.present.bit_count() for sweep in sweeps)
+    assert counters.frames == used + counters.halves + counters.late
+    assert used >= 2 * (cut // 2) * 55
+
+
 @pytest.mark.parametrize("triangles", [1, 2])
 def test_a_board_that_changes_its_order_loses_nothing_however_slowly_it_sends(
     triangles: int,

@@ -169,7 +169,7 @@ def test_the_size_of_a_step_does_not_change_the_bytes() -> None:
     assert runs[0] == runs[1] == runs[2]
 
 
-@pytest.mark.parametrize(("fault", "value"), [("bus_off", None), ("babbling_node", 0.9)])
+@pytest.mark.parametrize(("fault", "value"), [("bus_off", None), ("babbling_node", 1.0)])
 def test_the_size_of_a_step_does_not_change_how_long_a_bus_is_disturbed(
     fault: str, value: float | None
 ) -> None:

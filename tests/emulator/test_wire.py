@@ -33,8 +33,28 @@ def test_an_urgent_frame_overtakes_those_that_wait() -> None:
     wire.put(burst(4, 10, 0))
     wire.put(burst(2, 1, MS // 2))
     senders = (wire.until(10 * MS).id >> 4 & 0xF).tolist()
-    # 116 us a frame: four have passed by then.
-    assert senders == [4] * 4 + [2] + [4] * 6
+    # 116 us a frame: four have passed by then, and the fifth is not interrupted.
+    assert senders == [4] * 5 + [2] + [4] * 5
+
+
+def test_a_node_that_leaves_a_tenth_of_the_bus_leaves_it_to_the_others() -> None:
+    """Its next frame waits for the end of theirs, which takes nine times as long as the gap."""
+    wire = wire_of()
+    wire.babble(0.9, 0)
+    wire.put(burst(4, 40, 0))
+    # 40 frames of 116 us take ten times as long, and as long again is for their share to begin.
+    sent = wire.until(round(40 * 0.116 * 11 * MS))
+    assert np.count_nonzero(sent.id != 0) == 40
+    assert (np.diff(sent.t_ns) >= 116_000).all()
+
+
+def test_a_node_that_leaves_no_gap_keeps_all_others_from_the_bus() -> None:
+    wire = wire_of()
+    wire.babble(1.0, 0)
+    wire.put(burst(4, 40, MS))
+    assert not wire.until(100 * MS).id.any()
+    wire.babble(0.0, 100 * MS)
+    assert np.count_nonzero(wire.until(110 * MS).id) == 40
 
 
 @pytest.mark.parametrize("bitrate", [125_000, 500_000, 1_000_000])

@@ -894,6 +894,38 @@ def test_a_frame_whose_other_half_was_lost_just_before_the_end_is_accounted_for(
         assert runner.run(live()) is None
 
 
+def test_what_waited_for_a_full_bus_is_of_before_a_chip_was_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`gripper.toml`, seed 9331: it passes when the node that filled the bus is quiet again.
+
+    The computer slept meanwhile, so that its daemon awaits what the boards send next.
+    """
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    gripper = DEMO.with_name("gripper.toml")
+    settings, layout = load_skin(gripper)
+    world = World(settings, layout, gripper, 1, Scene(quiet=True))
+
+    async def live() -> str | None:
+        promises, life = start_watched(world)
+        await sampled(promises, 8.0)
+        babble = KINDS["babbling_node"](world, random.Random(1), True)
+        promises.begin(babble)
+        await sampled(promises, 0.1)
+        promises.begin(KINDS["suspended"](world, random.Random(1), True))
+        await sampled(promises, 0.1)
+        promises.begin(KINDS["chip_gone"](world, random.Random(1), True))
+        await sampled(promises, 1.05)
+        babble.end()
+        promises.end(babble)
+        await sampled(promises, 0.5)
+        life.kill()
+        return promises.broken
+
+    with world.clock.runner() as runner:
+        assert runner.run(live()) is None
+
+
 def test_what_is_retained_just_before_a_stall_is_at_the_broker_after_it(world: World) -> None:
     """It was on its way: seconds have passed when it arrives, and nobody was late."""
 
@@ -1203,6 +1235,25 @@ def test_damage_must_be_named_by_when_enough_of_it_came(world: World, kind: str)
         share = float(trouble.about.rpartition("=")[2])
         assert trouble.within_s == pytest.approx(36 / (40 * share))
         assert KINDS[kind](world, chance, True).within_s == 8.0
+
+
+@pytest.mark.parametrize("kind", ["frame_loss", "frames_lost"])
+def test_loss_must_be_named_by_when_a_second_with_enough_of_it_has_come(
+    world: World, kind: str
+) -> None:
+    """`gripper.toml`, seed 9350: 1.6 % of 80 frames a second, of which two in one may take long."""
+    few = DEMO.with_name("gripper.toml")
+    settings, layout = load_skin(few)
+    one = World(settings, layout, few, 1, Scene(quiet=True))
+    draws = np.random.default_rng(1)
+    for number in range(20):
+        trouble = KINDS[kind](one, random.Random(number), False)
+        share = float(trouble.about.rpartition("=")[2])
+        assert trouble.must == {"bus_loses_frames"}
+        seconds = draws.binomial(80, share * (1.0 - share), (20_000, round(trouble.within_s)))
+        assert np.count_nonzero((seconds < 2).all(axis=1)) <= 10
+        assert trouble.within_s == 5.0 or share < 0.06
+        assert KINDS[kind](world, random.Random(number), False).within_s == 5.0
 
 
 def test_a_fingertip_that_was_free_between_two_samples_need_not_be_touched_at_once(

@@ -58,6 +58,8 @@ class Excuses:
         """A trouble ends."""
         for triangle in trouble.blind:
             self.blind_since.pop(triangle, None)
+        if trouble.name == "babbling_node":
+            self._note_freed(trouble)
         if trouble in self.spoiling:
             self._recover(trouble)
             self.spoiling.remove(trouble)
@@ -121,6 +123,13 @@ class Excuses:
     def _lately_touched(self) -> Mask:
         lately: Mask = self.exempt | (self._now_ns() - self.touched_ns < RELAXED_NS)
         return lately
+
+    def _note_freed(self, trouble: Trouble) -> None:
+        """A bus is free again: what waited for it in the boards passes now, and is of before."""
+        assert trouble.places is not None
+        for board, triangle in self.blind_since:
+            if board in trouble.places:
+                self.blind_since[board, triangle] = self._now_ns()
 
     def _recover(self, trouble: Trouble) -> None:
         assert trouble.spoils is not None

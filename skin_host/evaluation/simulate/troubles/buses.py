@@ -15,7 +15,11 @@ from skin_host.bus.commands import (
 from skin_host.bus.port import LinkState
 from skin_host.evaluation.simulate.cables import Mischief
 from skin_host.evaluation.simulate.troubles.codes import BUS, CHIPS, SET_UP, TIMING
-from skin_host.evaluation.simulate.troubles.showing import rests, until_damage_shows_s
+from skin_host.evaluation.simulate.troubles.showing import (
+    rests,
+    until_damage_shows_s,
+    until_loss_shows_s,
+)
 from skin_host.evaluation.simulate.troubles.trouble import (
     Begin,
     Trouble,
@@ -26,8 +30,8 @@ from skin_host.evaluation.simulate.troubles.trouble import (
 )
 from skin_host.evaluation.simulate.world import World
 
-#: A bus that loses this share of its frames surely shows it.
-SURE_LOSS = 0.02
+#: A bus that loses this share of its frames shows it soon.
+SURE_LOSS = 0.05
 #: Pauses between the commands of another host: an MTB3 misses what comes while it zeroes itself.
 OTHER_HOST_S = (0.005, 0.05, 0.2)
 
@@ -55,11 +59,13 @@ def frames(
             world.move()
             setattr(cable.mischief, name, getattr(Mischief(), name))
 
-        bound_s, shows = 8.0, always
-        if name == "damaged":
+        bound_s, shows, surely = 8.0, always, sure
+        if name == "lost":
+            bound_s, surely = until_loss_shows_s(world, cable.name, share), 0.0
+        elif name == "damaged":
             bound_s = until_damage_shows_s(world, cable.name, share)
             shows = rests(world, cable.name)
-        is_sure = share >= sure and bound_s < math.inf
+        is_sure = share >= surely and bound_s < math.inf
         return Trouble(
             f"frames_{name}",
             f"frames_{name} bus={cable.name} share={share}",
@@ -93,8 +99,8 @@ def light_loss(world: World, chance: random.Random, _: bool) -> Trouble:
         end,
         # The temperature moves meanwhile.
         BUS | {"part_temperature"},
-        frozenset({"bus_loses_frames"} if max(shares.values()) >= SURE_LOSS else ()),
-        8.0,
+        frozenset({"bus_loses_frames"}),
+        min(until_loss_shows_s(world, name, share) for name, share in shares.items()),
         lasts_s=(60.0, 150.0),
     )
 

@@ -128,7 +128,9 @@ KINDS: dict[str, Begin] = {
         values=(2.0, 8.0),
         sure=6.0,
     ),
-    "frame_loss": emulated("frame_loss", BUS, {"bus_loses_frames"}, 5.0, values=(0.01, 0.3)),
+    "frame_loss": emulated(
+        "frame_loss", BUS, {"bus_loses_frames"}, values=(0.01, 0.3), sure=SURE_LOSS
+    ),
     "bit_errors": emulated(
         "bit_errors",
         BUS | DAMAGED,
@@ -143,6 +145,7 @@ KINDS: dict[str, Begin] = {
         BUS | {"bus_babbling", "bus_drops"},
         {"bus_babbling"},
         2.0,
+        values=(0.6, 1.2),  # a third of them leave no gap
         lasts_s=(0.5, 3.0),  # thousands of frames a second cost what minutes of others do
     ),
     "temperature_step": emulated(

@@ -17,6 +17,7 @@ from skin_host.evaluation.simulate.troubles.showing import (
     scatters,
     temperature_shows,
     until_damage_shows_s,
+    until_loss_shows_s,
 )
 from skin_host.evaluation.simulate.troubles.trouble import (
     FOR_EVER_S,
@@ -80,7 +81,8 @@ def emulated(
     Args:
         name: of it.
         may, must, within_s, spoils, recovers_s, lingers, lasts_s, lasting: see `Trouble`.
-        values: least and most of its value.
+        values: least and most of its value, of which what is out of the catalogue's bounds is put
+            on them.
         sure: from this value on, it must be reported.
     """
 
@@ -100,7 +102,9 @@ def emulated(
             targets["taxel"] = chance.randrange(12)
         if "bus" in kind.needs:
             targets["bus"] = bus
-        value = None if values is None else round(chance.uniform(*values), 4)
+        value = None
+        if values is not None and kind.bounds is not None:
+            value = round(min(max(chance.uniform(*values), kind.bounds[0]), kind.bounds[1]), 4)
         if plain and value is not None and values is not None and abs(value) < sure:
             value = round(chance.uniform(sure, values[1]), 4)
         if name == "data_held_low" and plain:
@@ -159,6 +163,8 @@ def emulated(
         if name == "stuck_taxel":
             pad = int(str(targets["taxel"]))
             bound_s = max(within_s, longest_chance_s(world, board, triangle, pad))
+        elif name == "frame_loss" and value is not None:
+            bound_s, surely = until_loss_shows_s(world, bus, value), 0.0
         elif name == "bit_errors" and value is not None:
             bound_s, shows = until_damage_shows_s(world, bus, value), rests(world, bus)
         elif name == "jittered_period":

@@ -8,7 +8,7 @@ import numpy as np
 from skin_host.bus.compensation import thermal_gains
 from skin_host.evaluation.simulate.world import World
 from skin_host.health.describe import enough_rest
-from skin_host.health.diagnosis import JITTER_SHARE
+from skin_host.health.diagnosis import FEW_HALVES, JITTER_SHARE
 from skin_host.layout import PadKind
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.stuck import CALIBRATED_SAMPLES, ODDS, longest_run, rate_in_run
@@ -23,6 +23,8 @@ SURE_NOISE_UNITS, SURE_NOISE, MOST_NOISE_UNITS = 5.0, 8.0, 20.0
 SURE_DAMAGED = 36
 #: Of many more it is named within this.
 DAMAGED_S = 8.0
+#: Lost frames are named within this, or once no second with enough of them has only these odds.
+LOST_S, ALL_HID = 5.0, 1e-4
 #: A pad may have moved less than most, so it may repeat itself so often before it is surely stuck.
 LEAST_REPEATS = 400
 
@@ -112,14 +114,30 @@ def temperature_shows(world: World) -> Callable[[], bool]:
     return shows
 
 
-def until_damage_shows_s(world: World, bus: str, share: float) -> float:
-    """Return by when it must be known that a bus damages a share of its frames (s)."""
-    frames_hz = sum(
+def _frames_hz(world: World, bus: str) -> float:
+    return sum(
         2 * len(board.triangles) * 1000 / board.settings.period_ms
         for board in world.layout.boards
         if board.settings.bus == bus
     )
+
+
+def until_damage_shows_s(world: World, bus: str, share: float) -> float:
+    """Return by when it must be known that a bus damages a share of its frames (s)."""
+    frames_hz = _frames_hz(world, bus)
     return max(DAMAGED_S, SURE_DAMAGED / (share * frames_hz)) if frames_hz else math.inf
+
+
+def until_loss_shows_s(world: World, bus: str, share: float) -> float:
+    """Return by when it must be known that a bus loses a share of its frames (s).
+
+    It shows by triangles of which one frame comes, a few within a second.
+    """
+    halves_hz = _frames_hz(world, bus) * share * (1.0 - share)
+    if not halves_hz:
+        return math.inf
+    odds = sum(halves_hz**n / math.factorial(n) for n in range(FEW_HALVES)) * math.exp(-halves_hz)
+    return max(LOST_S, 1.0 + math.log(ALL_HID) / math.log(odds)) if odds else LOST_S
 
 
 def rests(world: World, bus: str) -> Callable[[], bool]:
