@@ -290,6 +290,11 @@ class Fate:
     read: int = 0
 
 
+def _babbles(batch: FrameBatch) -> bool:
+    """Return whether a node that babbles is among those that sent these frames."""
+    return bool((batch.id == 0).any())
+
+
 class Cable:
     """One bus.
 
@@ -298,7 +303,7 @@ class Cable:
         clock: time.
         move: brings the robot to the present, which calls `arrive` of each cable.
         command: gives a frame of the host to the robot.
-        passes: whether the bus itself passes frames now.
+        passes, loses: whether the bus itself passes frames now, and whether it loses some.
         rng: draws what happens to frames.
 
     Attributes:
@@ -306,8 +311,9 @@ class Cable:
         state: of the interface, as the port is to find it.
         damaged_ns: when a frame was last damaged.
         blurred_ns: when frames last came late or in another order while a second board sent at
-            their address, or a board's sweeps passed close together, or were lost while a second
-            board sent: what belongs to which cannot be known then.
+            their address, or a board's sweeps passed close together, or were lost, or held up by a
+            node that babbles, while a second board sent: what belongs to which cannot be known
+            then.
         fate: what became of the frames since the port was opened.
         sent: what passed over the bus.
     """
@@ -319,6 +325,7 @@ class Cable:
         move: Callable[[], None],
         command: Callable[[str, int, bytes], None],
         passes: Callable[[], bool],
+        loses: Callable[[], bool],
         rng: np.random.Generator,
         trace: Trace,
     ) -> None:
@@ -331,7 +338,7 @@ class Cable:
         self.move = move
         self._clock = clock
         self._command = command
-        self._passes = passes
+        self._passes, self._loses = passes, loses
         self._rng = rng
         self._trace = trace
         self._port: SimulatedPort | None = None
@@ -389,7 +396,7 @@ class Cable:
             self.sent.note(batch)
         what = self.mischief
         is_late = what.late or what.swapped or self._late
-        if is_late or (what.lost and what.twin is not None):
+        if is_late or (what.twin is not None and (what.lost or self._loses() or _babbles(batch))):
             now_ns = self._clock.monotonic_ns()
             if what.twin is not None or now_ns - self.sent.crowded_ns < CROWDED_NS:
                 self.blurred_ns = now_ns

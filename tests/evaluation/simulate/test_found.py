@@ -1051,11 +1051,42 @@ def test_the_rest_of_a_sweep_that_more_urgent_boards_hold_up_is_of_that_sweep() 
     assert sent.bursts == {14: 2}
 
 
+def cable_of(clock: SteppedClock, *, loses: bool = False) -> Cable:
+    """A bus without a robot."""
+    rng = np.random.default_rng(1)
+    nothing, always = (lambda *_: None), (lambda: True)
+    return Cable("can0", clock, nothing, nothing, always, lambda: loses, rng, Trace())
+
+
+@pytest.mark.parametrize(
+    ("twin", "loses", "lost", "babbles", "is_blurred"),
+    [
+        (1, False, 0.0, False, False),
+        (1, True, 0.0, False, True),
+        (1, False, 0.1, False, True),
+        (1, False, 0.0, True, True),
+        (None, True, 0.1, True, False),
+    ],
+)
+def test_which_of_two_boards_sent_what_is_unknown_where_frames_are_lost_or_held_up(
+    twin: int | None, loses: bool, lost: float, babbles: bool, is_blurred: bool
+) -> None:
+    """`gripper.toml` 9362, `icub_hand.toml` 9249: a triangle has a frame of each."""
+    clock = SteppedClock(seed=1)
+    cable = cable_of(clock, loses=loses)
+    port = SimulatedPort(cable, Bus(interface="virtual", channel="two"), clock)
+    cable.mischief.twin, cable.mischief.lost = twin, lost
+    now_ns = clock.monotonic_ns()
+    frames = [(0x411, bytes([header, *range(7)]), now_ns) for header in (HEADER_A, HEADER_B)]
+    cable.arrive(FrameBatch.of([*frames, *[(0, bytes(8), now_ns)] * babbles]))
+    assert (cable.blurred_ns == now_ns) == is_blurred
+    port.close()
+
+
 def test_a_frame_that_comes_late_is_stamped_when_it_came_not_when_it_was_read() -> None:
     """Read much later, it would stand between the halves of a sweep that came meanwhile."""
     clock = SteppedClock(seed=1)
-    rng = np.random.default_rng(1)
-    cable = Cable("can0", clock, lambda: None, lambda *_: None, lambda: True, rng, Trace())
+    cable = cable_of(clock)
     port = SimulatedPort(cable, Bus(interface="virtual", channel="late"), clock)
     cable.mischief.late = 1.0
     began_ns = clock.monotonic_ns()
@@ -1074,8 +1105,7 @@ def test_a_frame_that_comes_late_is_stamped_when_it_came_not_when_it_was_read() 
 def test_frames_of_different_sweeps_do_not_change_places() -> None:
     """Sweeps that wait together after a stall came 50 ms apart."""
     clock = SteppedClock(seed=1)
-    rng = np.random.default_rng(1)
-    cable = Cable("can0", clock, lambda: None, lambda *_: None, lambda: True, rng, Trace())
+    cable = cable_of(clock)
     port = SimulatedPort(cable, Bus(interface="virtual", channel="stall"), clock)
     cable.mischief.swapped = 1.0
     frames = [
