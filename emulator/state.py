@@ -18,7 +18,7 @@ import numpy as np
 from skin_host.errors import RequestError
 from skin_host.files import read_whole
 
-MAGIC = b"skin-emulator-state/11\n"
+MAGIC = b"skin-emulator-state/12\n"
 DIGEST_BYTES = 32
 #: Decimal places of positions (m) and of what else the digest has of a layout.
 PLACES = 9

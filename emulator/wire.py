@@ -2,7 +2,8 @@
 
 A frame whose transmission has begun is not interrupted (ISO 11898-1: arbitration is at its start).
 Boards have short queues. What does not fit is lost: an MTB4 drops the newest frames, an MTB3
-drops its whole stack and reports that.
+drops its whole stack and reports that. An MTB3 answers commands between its bursts, so an answer
+always finds room.
 """
 
 from collections import deque
@@ -25,6 +26,7 @@ QUEUE_FRAMES = 48
 #: A board's bursts have the same identifiers, the same array, until it is set up again; of so many
 #: it is remembered how long they take.
 _MOST_PASSED = 64
+_STREAMS = (MessageClass.ANALOG_STREAM, MessageClass.SKIN_STREAM)
 #: So few frames are handed over in plain numbers: numpy takes longer.
 FEW = 4
 NEVER_NS = 1 << 62
@@ -72,8 +74,8 @@ class Wire:
 
     def babble(self, share: float, t_ns: int) -> None:
         """From `t_ns` on a node fills `share` of the bus with frames of identifier 0."""
-        frame_ns = (OVERHEAD_BITS + STUFF_BITS + 64) * self._bit_ns
-        self._babble_every_ns = round(min(frame_ns / share, NEVER_NS)) if share else 0
+        every_ns = self._babble_frame_ns / share if share else 0.0
+        self._babble_every_ns = round(min(every_ns, NEVER_NS))
         self._babbled_ns = t_ns
 
     def put(self, batch: FrameBatch, ready_ns: int | None = None) -> None:
@@ -88,6 +90,15 @@ class Wire:
         alone = not len(self._waiting)
         self._waiting = batch if alone else join([self._waiting, batch])
         self._ready_ns = ready_ns if alone else None
+
+    @property
+    def full(self) -> bool:
+        """Whether a babbling node leaves no gap: nothing of others passes."""
+        return 0 < self._babble_every_ns <= self._babble_frame_ns
+
+    @property
+    def _babble_frame_ns(self) -> float:
+        return (OVERHEAD_BITS + STUFF_BITS + 64) * self._bit_ns
 
     @property
     def silent(self) -> bool:
@@ -177,6 +188,9 @@ class Wire:
         n = len(sent)
         wrong = np.flatnonzero(self._rng.random(n) < self.error_share)
         bit = self._rng.integers(0, 64, len(wrong))
+        # Of the bits that a frame has; one without data is not changed.
+        bits = 8 * sent.dlc[wrong].astype(np.int64)
+        wrong, bit = wrong[bits > 0], bit[bits > 0] % bits[bits > 0]
         sent.data[wrong, bit // 8] ^= (1 << bit % 8).astype(np.uint8)
         return _rows(sent, self._rng.random(n) >= self.loss_share)
 
@@ -190,7 +204,12 @@ class Wire:
             queued = int(np.count_nonzero(senders == sender))
             new = group.id >> 4 & 0xF == sender
             room = QUEUE_FRAMES - queued
-            if queued and self._stack_size(int(sender)) is not None:
+            stack_size = self._stack_size(int(sender))
+            if stack_size is not None:
+                is_burst = np.isin(group.id[new] >> 8, _STREAMS).any()
+                fits = queued + np.count_nonzero(new) <= stack_size
+                if not queued or fits or not is_burst:
+                    continue
                 keep &= senders != sender
                 self.lost += queued
                 notice = identifier(MessageClass.MANAGEMENT, int(sender), TX_OVERFLOW_TYPE)

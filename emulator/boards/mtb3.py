@@ -58,8 +58,10 @@ TIMERS = {
 #: Five entries, but the index never reaches the last.
 RECEIVE_ENTRIES = 4
 NO_ACKS_TO_CALIBRATE = 5
-#: Reading 16 chips at 300 kHz and waiting for 32 frames: the loop is never faster (ns).
-SHORTEST_CYCLE_NS = 7_000_000
+#: Reading 16 chips at 300 kHz, and waiting for a frame to be sent (ns).
+READ_NS, FRAME_NS = 3_400_000, 112_500
+#: With all triangles: the loop is never faster.
+SHORTEST_CYCLE_NS = READ_NS + 2 * TRIANGLES * FRAME_NS
 SHIFT_THREE, SHIFT_ALL = 3, 4
 PERIODS_TO_CALIBRATE = 2
 ANY_SENDER = 0x70F
@@ -68,9 +70,10 @@ ANY_SENDER = 0x70F
 class Mtb3(Mtb):
     """The MTB3.
 
-    Commands are executed by the main loop, newest first, and not while it calibrates; that
-    takes two periods. Command 50 makes the board send by itself afterwards. Any frame of
-    class 7 stops the sampling timer until 07, 50, 4C, 4E or (while sending) 4D.
+    Commands are executed by the main loop, newest first, and not while it reads the chips and
+    sends a burst, nor while it calibrates; that takes two periods. Command 50 makes the board send
+    by itself afterwards. Any frame of class 7 stops the sampling timer until 07, 50, 4C, 4E or
+    (while sending) 4D.
 
     The transmit queue is a stack: the emulator sends the newest frame of every 20 first. In
     the source the loop waits for an idle controller before it stacks a second frame, so a
@@ -104,6 +107,8 @@ class Mtb3(Mtb):
         self._calibrate_at_tick = False
         self._baseline_ns: int | None = None
         self._back_ns: int | None = None
+        #: Until then the loop reads the chips and sends.
+        self._busy_until_ns = t_ns
         self._restart_ns: int | None = None
         self._configure_all()
         self._begin_calibration(t_ns)
@@ -135,7 +140,8 @@ class Mtb3(Mtb):
         self._calibrate(t_ns)
         if self._back_ns is not None:
             return False
-        self._run_received(t_ns)
+        if t_ns >= self._busy_until_ns:
+            self._run_received(t_ns)
         if self.next_ns is None or t_ns < self.next_ns:
             return False
         self.next_ns += max(self.period_ns, SHORTEST_CYCLE_NS)
@@ -149,6 +155,8 @@ class Mtb3(Mtb):
             self._to_update[:] = False
             self._begin_calibration(t_ns)
             return False
+        frames = 2 * int(np.count_nonzero(self.triangles))
+        self._busy_until_ns = t_ns + READ_NS + frames * FRAME_NS
         return self._sending or self._stages is not StageMap.SINGLE
 
     @property
@@ -158,7 +166,11 @@ class Mtb3(Mtb):
             return self._restart_ns
         if self._baseline_ns is not None:
             return self._baseline_ns
-        return self.next_ns if self._back_ns is None else self._back_ns
+        if self._back_ns is not None:
+            return self._back_ns
+        if self._received:
+            return self._busy_until_ns
+        return self.next_ns
 
     def count_no_ack(self, triangles: int) -> None:
         """The fifth bad reading since the last time re-baselines the whole board."""
@@ -242,7 +254,8 @@ class Mtb3(Mtb):
 
     def _run_if_free(self, t_ns: int) -> None:
         """Run what has been received, if the main loop gets to it, or the bootloader's."""
-        if self._restart_ns is not None or self._back_ns is None:
+        is_busy = self._back_ns is not None or t_ns < self._busy_until_ns
+        if self._restart_ns is not None or not is_busy:
             self._run_received(t_ns)
 
     def _run_received(self, t_ns: int) -> None:

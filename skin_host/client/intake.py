@@ -226,7 +226,7 @@ class Intake:
         elif isinstance(item, Frame):
             run = run_of(message.properties)
             if self._order.take_frame(item, run, now_s):
-                self.presence.take_sign(part, now_s)
+                self.presence.take_data(part, now_s)
                 self._put(kind, item, run)
         elif kind == "contact":
             assert item is None or isinstance(item, Contact)
@@ -270,7 +270,7 @@ class Intake:
             self.presence.take_touch(event, _now_s(), run)
         else:
             kind = "slip" if isinstance(event, Slip) else "over"
-            self.presence.take_sign(event.part, _now_s())
+            self.presence.take_data(event.part, _now_s())
         self._put(kind, event, run)
 
     def _put(

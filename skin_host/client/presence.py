@@ -117,8 +117,13 @@ class _Part:
         stale_s: float,
         sent_s: float | None = None,
         connection: int | None = None,
+        *,
+        behind_state: bool = True,
     ) -> None:
         """Take a sign of life: it shows that the part lived when it was sent.
+
+        What comes before the newest state, or was kept for us, makes no OFF true that is not known
+        to be.
 
         A stale part comes back with a message that is half as late as one that makes it stale, so
         that it does not flap where messages come about as late as that.
@@ -127,12 +132,16 @@ class _Part:
         another then. Not if what came before was late: a broker that is held up sends the messages
         of the next connection after those of the last one, and as late.
         """
+        is_alive = now_s - self.alive_s <= stale_s
+        is_old = self.received == "OFF" or (self.received is None and self.reported is not None)
+        if is_old and not (behind_state or is_alive):
+            return
         if sent_s is not None:
             if connection != self.connection and self.late_s <= stale_s / 2:
                 self.lateness = Lateness()
             self.connection = connection
             self.late_s = self.lateness.of(sent_s, now_s)
-        if now_s - self.alive_s <= stale_s or self.late_s <= stale_s / 2:
+        if is_alive or self.late_s <= stale_s / 2:
             if self.alive_s == -math.inf and self.received == "OFF":
                 self.touches.clear()
             self.alive_s = max(self.alive_s, now_s - self.late_s)
@@ -220,16 +229,21 @@ class Presence:
     def take_sign(
         self, part: str, now_s: float, sent_s: float | None = None, connection: int | None = None
     ) -> None:
-        """Take any other message of a part that was not a retained one."""
+        """Take a health record of a part that was not a stored one: it follows the newest state."""
         if part in self._parts:
             self._parts[part].hear(now_s, self._stale_s, sent_s, connection)
+
+    def take_data(self, part: str, now_s: float) -> None:
+        """Take a frame or an event of a part: it may come before the state that changes with it."""
+        if part in self._parts:
+            self._parts[part].hear(now_s, self._stale_s, behind_state=False)
 
     def take_touch(self, touch: Touch, now_s: float, run: int | None = None) -> None:
         """Take a touch, of a run of the node if that is known; those of the runs before have ended
         with them.
         """
         part = self._parts.setdefault(touch.part, _Part())
-        part.hear(now_s, self._stale_s)
+        part.hear(now_s, self._stale_s, behind_state=False)
         if run is not None and run != part.run:
             part.touches.clear()
             part.run = run

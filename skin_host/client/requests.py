@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from skin_host.errors import RequestError, SkinError
-from skin_host.mqtt.commands import Result, encode_request
+from skin_host.mqtt.commands import MAX_REQUEST_BYTES, Result, encode_request
 from skin_host.mqtt.topics import NAME, WRONG_NAME
 
 #: A node answers a command within this time, and that for which the command lasts.
@@ -72,7 +72,7 @@ class Requests:
         """Make a request, which waits for its answer until the context ends.
 
         Raises:
-            RequestError: the command can have no such name, or a number cannot be sent.
+            RequestError: the command can have no such name, or an argument cannot be sent.
         """
         refuse_wrong_name(name)
         number = f"{self._identifier}-{next(self._numbers)}"
@@ -80,6 +80,13 @@ class Requests:
             request = Request(encode_request({**arguments, "id": number}))
         except ValueError:
             raise RequestError(f"{name}: seen nan or inf, wanted numbers") from None
+        except (TypeError, RecursionError) as error:
+            raise RequestError(f"{name}: {error}; wanted what JSON has") from None
+        size = len(request.payload)
+        if size > MAX_REQUEST_BYTES:  # its node would read no `id` to answer
+            raise RequestError(
+                f"{name}: the request has {size} bytes; wanted at most {MAX_REQUEST_BYTES}"
+            )
         self.waiting[number] = request
         try:
             yield request

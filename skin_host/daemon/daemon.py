@@ -400,6 +400,15 @@ class Daemon:
             part = self.layout.parts[index]
             yield self._contacts[index], taxels[part.start : part.stop]
 
+    def _note_unread(self) -> None:
+        """Nothing was read for a while: no part is known to be untouched."""
+        for part, contact in self._contacts.items():
+            if part not in self.engine.disabled:
+                self.publisher.put_contact(self.layout.parts[part].name, contact.unread())
+        tips = self.engine.fingertips
+        for name, state in ({} if tips is None else tips.tips).items():
+            self.publisher.put_contact(name, "ON" if state.tip.touched else "UNKNOWN")
+
     def _end_contacts(self, part: int) -> None:
         events = self.engine.end_part(part, self.clock.now_ns())
         for event in events:
@@ -476,7 +485,11 @@ class Daemon:
         service.notify("READY=1")
 
     def _deliver(self, output: Output) -> None:
-        if self.engine.fingertips is not None:
+        if self.link.is_behind:
+            self._note_unread()
+            for event in output.grasps:
+                self.publisher.put_touch(event)
+        elif self.engine.fingertips is not None:
             self.fingertips.deliver(output.grasps)
         if output.steps:
             if self._zero_changes != self.engine.zeros.changes:
@@ -491,11 +504,16 @@ class Daemon:
                 for event in step.events:
                     self.publisher.put_touch(event)
                 state = self._contacts[step.part].step(step.frame, step.events)
+                if self.link.is_behind:
+                    state = self._contacts[step.part].unread()
                 self.publisher.put_contact(step.frame.part, state)
             self.health.note(output)
             for step in output.steps:
                 if step.part not in self.engine.touch_only:
-                    self.publisher.put_frame(step.frame)
+                    if self.link.is_behind:
+                        self.publisher.skip_frame()  # its pressures would look like those of now
+                    else:
+                        self.publisher.put_frame(step.frame)
         # Notify systemd's watchdog only here, after work that was done.
         if self._feed_s is not None:
             now_s = self.clock.monotonic_s()
@@ -515,6 +533,9 @@ class Daemon:
         pulse: tuple[object, ...] = ()
         while True:
             await self.clock.sleep(LOOK_S)
+            if self.link.is_behind or self.link.is_overdue():
+                self._note_unread()  # health would be of before, too
+                continue
             self.link.supervise()
             now_s = self.clock.monotonic_s()
             self.keeper.look(now_s)

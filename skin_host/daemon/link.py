@@ -23,6 +23,7 @@ from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError, SkinError
 from skin_host.fingertip.service import StrainBoards
+from skin_host.processing.contacts import LOST_NS
 from skin_host.processing.core import EXPIRE_NS, Engine, Output
 
 log = logging.getLogger(__name__)
@@ -86,6 +87,9 @@ class Link:
         read_ns: everything received up to then has been read, on the clock of the frames' time
             stamps. Ages count from here, not from now: a board whose frames wait unread has not
             timed out.
+        is_behind: what is read now is of before: nothing was read for so long that nobody knows
+            what is felt, and not all has been read since, as far as that takes no longer than
+            `LONGEST_PATIENCE_NS`.
 
     Raises:
         ConfigurationError: python-can has no such kind of interface.
@@ -146,6 +150,8 @@ class Link:
         #: How many sweeps of each board had been received when a turn was last held up.
         self._sweeps_then = engine.ledger.sweeps.copy()
         self._longest_pause_ns = 0
+        self.is_behind = False
+        self._overdue_ns = max(LOST_NS, self._held_up_ns)
         #: Identifier, data and time of each frame that was sent since the last turn, by bus.
         self._sent: dict[str, list[tuple[int, bytes, int]]] = {}
         #: Bus, receiver and command of what was sent, and when, s: some buses return it.
@@ -199,6 +205,7 @@ class Link:
         self._untried.update(self._all_boards())
         # What opening takes is no stall of this computer.
         self._turned_ns = clock.now_ns()
+        self._turned_at_boot_ns = self._behind_at_boot_ns = clock.since_boot_ns()
 
     def use(self, engine: Engine) -> None:
         """Continue with another engine, which has the ledger of the one before."""
@@ -254,6 +261,11 @@ class Link:
             now_ns: the time, on the clock of the frames' time stamps.
             deliver, record: see `read`.
         """
+        boot_ns = self._clock.since_boot_ns()
+        if self.is_overdue():
+            self.is_behind, self._behind_at_boot_ns = True, boot_ns
+            deliver(Output([], [], [], [], []))  # known at once, also where nothing waits
+        self._turned_at_boot_ns = boot_ns
         pause_ns, self._turned_ns = now_ns - self._turned_ns, now_ns
         if pause_ns > self._held_up_ns:
             self._note_held_up(now_ns, pause_ns)
@@ -282,6 +294,10 @@ class Link:
                 self._note(output)
                 deliver(output)
         self.read_ns = read_ns
+        # What brings the frames may have been held up, too.
+        self.is_behind &= (
+            is_behind or self._held_up_at_ns is not None
+        ) and boot_ns - self._behind_at_boot_ns < LONGEST_PATIENCE_NS
         # What is behind is complete up to its last frame, whatever held this computer up.
         if self._held_up_at_ns is not None and not is_behind and self._is_patient(now_ns):
             self._engine.ledger.pass_over(read_ns)
@@ -380,6 +396,12 @@ class Link:
             return True
         self._held_up_at_ns = None
         return False
+
+    def is_overdue(self) -> bool:
+        """Return whether nothing was read for so long that nobody knows what is felt: this computer
+        was held up, stopped or asleep.
+        """
+        return self._clock.since_boot_ns() - self._turned_at_boot_ns >= self._overdue_ns
 
     def longest_pause_ns(self) -> int:
         """Return by how long a turn was held up at most since this was last called; 0: by less

@@ -12,7 +12,7 @@ from typing import Any
 
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.daemon import service
-from skin_host.daemon.calibrate import stored_calibration
+from skin_host.daemon.calibrate import keep_former, stored_calibration
 from skin_host.daemon.joining import Memories, NodeFiles, NodeMemory
 from skin_host.daemon.state import (
     NodeState,
@@ -216,7 +216,12 @@ def _keep(settings: Settings, layout: Layout, node: str, memory: NodeMemory) -> 
     calibration = memory.calibration
     documents: dict[str, Callable[[Path], None]] = {}
     if calibration is not None:
-        documents["calibration"] = lambda path: save_calibration(path, calibration, layout)
+
+        def write_calibration(path: Path) -> None:
+            keep_former(path, layout, skin_hash(settings))
+            save_calibration(path, calibration, layout)
+
+        documents["calibration"] = write_calibration
     documents["state"] = lambda path: write_document(path, memory.state)
     if calibration is not None:
         documents["zeros"] = lambda path: write_document(path, memory.zeros)
@@ -224,9 +229,10 @@ def _keep(settings: Settings, layout: Layout, node: str, memory: NodeMemory) -> 
         path = kept_path(settings, node, what)
         try:
             write(path)
-        except OSError as error:
-            unkept[what] = f"{path}: {error.strerror}"
-            log.error("%s not kept: %s", what, unkept[what])
+        except (OSError, SkinError) as error:
+            reason = f"{path}: {error.strerror}" if isinstance(error, OSError) else str(error)
+            unkept[what] = reason
+            log.error("%s not kept: %s", what, reason)
     return unkept
 
 

@@ -92,6 +92,7 @@ async def run(commands: dict[str, list[str]]) -> int:
     processes: dict[str, asyncio.subprocess.Process] = {}
 
     ending: int | None = None  # the signal that asked for it
+    asked = asyncio.Event()
 
     def forward(number: int) -> None:
         for process in processes.values():
@@ -113,6 +114,7 @@ async def run(commands: dict[str, list[str]]) -> int:
         nonlocal ending
         forward(number if ending is None else signal.SIGKILL)  # a second one ends at once
         ending = number
+        asked.set()
 
     for caught in service.ENDING:
         loop.add_signal_handler(caught, end, caught)
@@ -137,7 +139,11 @@ async def run(commands: dict[str, list[str]]) -> int:
                 break
         service.take_hangups()
         waiting = [asyncio.ensure_future(process.wait()) for process in processes.values()]
-        await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+        asking = asyncio.create_task(asked.wait())
+        await asyncio.wait([*waiting, asking], return_when=asyncio.FIRST_COMPLETED)
+        asking.cancel()
+        # The first of them has as long as the others have after it.
+        await asyncio.wait(waiting, timeout=STOP_S, return_when=asyncio.FIRST_COMPLETED)
         if ending is None:
             for name, process in processes.items():
                 number = -(process.returncode or 0)

@@ -101,13 +101,13 @@ class CommandHandler:
 
     Attributes:
         taken: requests that were given to the handler.
-        refused: requests that were not: too large, too many, retained, or not JSON.
+        refused: requests that were not: too large, too many, retained, not JSON, delivered twice.
     """
 
     def __init__(self, handler: Handler) -> None:
         self._handler = handler
-        #: With the names of the commands.
-        self._running: dict[asyncio.Task[None], str] = {}
+        #: With the names of the commands, and their requests.
+        self._running: dict[asyncio.Task[None], tuple[str, bytes]] = {}
         self._tokens = float(BURST)
         self._filled_s: float | None = None
         self._flooded = False
@@ -120,7 +120,9 @@ class CommandHandler:
     def take(self, name: str, payload: bytes, answer: Answer) -> None:
         """Start a request. Above the rate a request is counted and not answered.
 
-        An answer to each of a flood of requests would make the flood twice as large.
+        An answer to each of a flood of requests would make the flood twice as large. The same holds
+        for one that comes again with its `id` while it runs: the broker has delivered it twice, and
+        who asks would take a refusal of the second one for the answer.
         """
         if not self._token():
             if not self._flooded:
@@ -131,6 +133,9 @@ class CommandHandler:
         identity: str | int | UnsetType = UNSET
         try:
             identity = _identity(name, payload)
+            if identity is not UNSET and (name, payload) in self._running.values():
+                self.refused += 1
+                return
             self._check_moment(name)
         except SkinError as error:
             self.refused += 1
@@ -139,7 +144,7 @@ class CommandHandler:
             return
         self.taken += 1
         task = asyncio.get_running_loop().create_task(self._run(name, payload, identity, answer))
-        self._running[task] = name
+        self._running[task] = name, payload
         task.add_done_callback(self._running.pop)
 
     def ignore_retained(self, topic: str) -> None:
@@ -183,7 +188,8 @@ class CommandHandler:
     def _check_moment(self, name: str) -> None:
         if self._ending:
             raise StateError(ENDING)
-        if len(self._running) >= MAX_RUNNING and name in self._running.values():
+        running = [one for one, _ in self._running.values()]
+        if len(running) >= MAX_RUNNING and name in running:
             raise StateError(
                 f"{MAX_RUNNING} commands are running already, and one of this name; try again later"
             )

@@ -137,6 +137,12 @@ class PartContact:
         np.copyto(self._lost, self._decides, where=self._lost > 0.0)
         np.copyto(self._unsure, self._triangle_decides, where=self._unsure > 0.0)
 
+    def unread(self) -> ContactState:
+        """What was felt for a while has not been read: what was untouched before may be touched."""
+        self._unsure[:] = self._triangle_decides
+        self._is_unsure = True
+        return "ON" if self._present or any_of(self._touched) else "UNKNOWN"
+
     def stop(self, events: Iterable[Touch]) -> ContactState:
         """End the contacts, because no data of the part will come for a while."""
         self._present.difference_update(event.id for event in events)

@@ -38,7 +38,8 @@ class PublisherCounters(Struct):
 
     Attributes:
         connections: how often the broker was reached.
-        frames_skipped: a newer frame came before they could be sent, or there was no broker.
+        frames_skipped: a newer frame came before they could be sent, there was no broker, or they
+            were read too late.
         touches_waiting: events in the queue now.
         moves_replaced: `move` events that were replaced by a newer one of their contact before they
             were sent, because many events waited; they leave no gap in `count`.
@@ -266,6 +267,18 @@ class Outbox:
         self._last_moves.clear()
         self.on_put()
         return len(again)
+
+    def renumber(self, properties: MessageProperties | None) -> None:
+        """Let touches that wait, and those that may be repeated, have these properties: of a run
+        that they name no more subscribers would pass them over.
+        """
+        self.events = deque(
+            event._replace(properties=properties) if event.is_touch else event
+            for event in self.events
+        )
+        again = [(at_s, event._replace(properties=properties)) for at_s, event in self.passed_on]
+        self.passed_on = deque(again, REPEATED)
+        self._last_moves.clear()
 
     def put_state(self, topic: str, payload: bytes) -> None:
         """Take a retained message; it replaces the one of the topic."""

@@ -59,7 +59,7 @@ from skin_host.mqtt.order import (
 )
 from skin_host.mqtt.outbox import Event, Outbox, PublisherCounters
 from skin_host.mqtt.payload import CBOR_TYPE, JSON_TYPE
-from skin_host.mqtt.topics import OFFLINE, ONLINE, PartTopic, Topics
+from skin_host.mqtt.topics import MAX_PART, OFFLINE, ONLINE, PartTopic, Topics
 from skin_host.mqtt.trials import TRIES, Trials
 from skin_host.processing.events import Touch
 from skin_host.processing.frame import PressureFrame
@@ -163,6 +163,8 @@ class Publisher:
         self._turn = 0  # index of the broker in use
         self._untried = len(self._brokers)
         self._last_broker: str | None = None
+        #: What was sent over the last connection was of a run that subscribers take for an old one.
+        self._overtakes = False
         self._info: NodeInfo | None = None
         self._pieces = 0
         #: Parts and fingertips of this node, and those of others in the configuration.
@@ -201,6 +203,7 @@ class Publisher:
         events = message_properties(self._broker, JSON_TYPE)
         put_run(events, run)
         self._event_properties = PackedProperties.of(events)
+        self._outbox.renumber(self._event_properties)
         cbor = self._encoding == "cbor"
         frames = message_properties(self._broker, CBOR_TYPE if cbor else JSON_TYPE, text=not cbor)
         if frames is not None:
@@ -228,6 +231,10 @@ class Publisher:
     def frames_waiting(self) -> int:
         """How many frames have not been written: the newest of each part at most."""
         return len(self._outbox.frames)
+
+    def skip_frame(self) -> None:
+        """Count a frame that is not sent, because it was read so late."""
+        self._outbox.counters.frames_skipped += 1
 
     def _unsubscribed(self) -> list[str]:
         if not self._outbox.counters.connected:
@@ -418,7 +425,8 @@ class Publisher:
         # The status makes valid what the broker retained of contacts, however old that is.
         contacts = (self.topics.part("contact", part) for part in self._states_of_contact)
         self._outbox.repeat_states([self._status, *contacts])
-        if self._last_broker not in (None, str(self._broker)):
+        if self._overtakes or self._last_broker not in (None, str(self._broker)):
+            self._overtakes = False
             self._courier.repeat_events()
         self._last_broker = str(self._broker)
         async with asyncio.TaskGroup() as group:
@@ -601,7 +609,10 @@ class Publisher:
                 self._note_left(parts_of(message.properties))
             stamp = stamp_of(message.properties)
             if message.retain and stamp is not None and self._numbers.overtake(stamp):
+                if self._connection is not None:
+                    self._connection.cut()  # what follows would come before what is sent again
                 self._number_messages()
+                self._overtakes = True
                 raise MqttError("an earlier run of this node had a clock that was ahead of ours")
             return
         commands, _, name = topic.rpartition("/")
@@ -613,8 +624,9 @@ class Publisher:
         reply_to: str = getattr(message.properties, "ResponseTopic", "")
         correlation: bytes = getattr(message.properties, "CorrelationData", b"")
         if not self.topics.may_reply_to(self._node, reply_to):
-            # If the response topic is not allowed, the answer goes to the default result topic.
-            reply_to = self.topics.result(self._node, name)
+            # If the response topic is not allowed, the answer goes to the default result topic. It
+            # would be longer than any with a name as long as a topic may be.
+            reply_to = self.topics.result(self._node, name[:MAX_PART])
         if len(correlation) > MAX_CORRELATION_BYTES:
             correlation = b""
         self._command_handler.take(name, payload, partial(self._answer, reply_to, correlation))

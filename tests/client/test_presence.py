@@ -378,6 +378,42 @@ def test_a_touch_that_comes_before_its_state_stays_though_its_part_was_untouched
     assert [one.id for one in presence.touches("palm", 0.2)] == [7]
 
 
+@pytest.mark.parametrize("what", ["touch", "frame"])
+def test_a_touch_that_comes_first_after_a_silence_is_not_taken_for_the_untouched_state_before_it(
+    what: str,
+) -> None:
+    """A node sends touches and frames before the states that change with them."""
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0)
+    assert presence.changes(0.0) == [Contact("palm", "OFF")]
+    assert presence.changes(4.0) == [Contact("palm", "UNKNOWN", "stale")]
+    if what == "touch":
+        presence.take_touch(seen("begin"), 4.1)
+    else:
+        presence.take_data("palm", 4.1)
+    assert presence.changes(4.1) == []
+    presence.take_state("palm", "ON", 4.2)
+    assert presence.changes(4.2) == [Contact("palm", "ON")]
+
+
+def test_events_that_the_broker_kept_for_us_make_no_stored_state_true() -> None:
+    """The robot may have lost its power since."""
+    presence = Presence(stale_s=3.0)
+    presence.take_info("arm", ["palm"], 0.0)
+    presence.take_node("arm", True, 0.0)
+    presence.take_state("palm", "OFF", 0.0)
+    presence.changes(0.0)
+    presence.take_loss()
+    assert presence.changes(1.0) == [Contact("palm", "UNKNOWN", "disconnected")]
+    presence.take_node("arm", True, 2.0)
+    for event in ("begin", "end"):
+        presence.take_touch(seen(event), 2.0)
+    presence.take_state("palm", "OFF", 2.1, stored=True)
+    assert presence.changes(2.1) == []
+    presence.take_sign("palm", 2.9)
+    assert presence.changes(2.9) == [Contact("palm", "OFF")]
+
+
 def test_a_state_that_its_only_broker_does_not_let_us_receive_any_more_is_not_known() -> None:
     presence = Presence(stale_s=3.0)
     presence.take_state("palm", "OFF", 0.0, 0)
@@ -462,7 +498,8 @@ def test_once_a_state_was_reported_no_loss_is_kept_quiet(steps: list[tuple[str, 
                 live_s = now_s
             case "touch":
                 presence.take_touch(seen("begin"), now_s)
-                live_s = now_s
+                is_old = state == "OFF" or (state is None and last is not None)
+                live_s = live_s if is_old and now_s - live_s > 3.0 else now_s
             case "loss":
                 presence.take_loss()
                 state, live_s, online = None, -10.0, None

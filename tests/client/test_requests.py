@@ -1,6 +1,7 @@
 """Requests wait for their answers, and for nobody else's."""
 
 import math
+from typing import Any
 
 import pytest
 from msgspec import json
@@ -50,7 +51,14 @@ def test_a_refusal_is_raised_with_its_cause(cause: Cause, kind: type[CommandErro
 
 def test_what_cannot_be_sent_is_refused_and_does_not_wait() -> None:
     requests = Requests("me")
-    for name, arguments in (("Status", {}), ("", {}), ("status", {"seconds": math.nan})):
-        with pytest.raises(RequestError), requests.request(name, arguments):
+    cases: list[tuple[str, dict[str, Any], str]] = [
+        ("Status", {}, "names of up to"),
+        ("", {}, "names of up to"),
+        ("status", {"seconds": math.nan}, "status: seen nan or inf"),
+        ("status", {"part": {1}}, "status: .*set.*; wanted what JSON has"),
+        ("status", {"part": "a" * 70_000}, "status: the request has 70.* bytes; wanted at most"),
+    ]
+    for name, arguments, why in cases:
+        with pytest.raises(RequestError, match=why), requests.request(name, arguments):
             pass
     assert not requests.waiting

@@ -326,6 +326,24 @@ def test_files_of_an_older_version_are_handed_over_too(skin: Skin) -> None:
     assert skin.start().zeros.unknown == {"a": [5], "b": [6]}
 
 
+def test_what_others_knew_does_not_replace_a_calibration_of_another_configuration(
+    skin: Skin, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The curves that were fitted for that one are in no other file."""
+    skin.keep("main", skin.calibration(1.0, 0))
+    path = skin.path("main", "calibration")
+    before = path.read_text().replace(skin_hash(skin.settings), "0123456789ab")
+    path.write_text(before)
+    share = skin.calibration(10.0, 10)
+    skin.keep("main-1", share, Zeros(calibration=share.id, parts=[*PARTS, TIP], written=after(20)))
+    memory = skin.start()
+    assert memory.from_others
+    assert skin.level(memory, "a") == 10.0
+    (former,) = [one for one in path.parent.iterdir() if ".former-" in one.name]
+    assert former.read_text() == before
+    assert "fit them again" in caplog.text
+
+
 def test_a_calibration_that_was_taken_since_ends_the_doubts_of_a_share(skin: Skin) -> None:
     """By `skin calibrate`, which writes the file of the whole node."""
     first = skin.calibration(3.0, 0)

@@ -14,7 +14,9 @@ from skin_host.config.settings import Bus
 from skin_host.health import Record
 from skin_host.mqtt.messages import ContactState
 from skin_host.mqtt.publisher import Publisher
+from skin_host.processing.contacts import LOST_NS
 from skin_host.processing.events import Touch
+from skin_host.processing.frame import PressureFrame
 from tests.support.live import Live, living
 from tests.support.stack import ROOT
 from tests.support.stepped import stepped
@@ -83,6 +85,61 @@ async def test_a_process_that_stood_still_takes_no_board_for_silent(
         clock.advance(3.0)
         await clock.sleep(0.5)
         assert not ledger.silences.any()
+
+
+@stepped
+async def test_what_was_untouched_before_a_process_stood_still_is_unknown_until_it_is_felt_again(
+    clock: SteppedClock, tmp_path: Path
+) -> None:
+    """Whatever presses it was not read, and health would publish the old state again."""
+    async with well(clock, tmp_path, "stepped-o") as live:
+        publisher = live.daemon.publisher
+        await live.wait(lambda: publisher._states_of_contact["left_hand"] == "OFF")
+        states: list[tuple[float, bytes]] = []
+        put = publisher._outbox.put_state
+
+        def note(topic: str, payload: bytes) -> None:
+            if topic.endswith("/left_hand/contact"):
+                states.append((clock.monotonic_s(), payload))
+            put(topic, payload)
+
+        late_ns: list[int] = []
+        put_frame = publisher.put_frame
+
+        def note_frame(frame: PressureFrame) -> None:
+            late_ns.append(clock.now_ns() - frame.t_ns)
+            put_frame(frame)
+
+        publisher._outbox.put_state = note  # type: ignore[method-assign]
+        publisher.put_frame = note_frame
+        for stood_s in (0.6, 3.0, 60.0):
+            states.clear()
+            clock.advance(stood_s)
+            went_on_s = clock.monotonic_s()
+            await clock.sleep(2.0)
+            assert [state for _, state in states][:2] == [b"UNKNOWN", b"OFF"]
+            assert states[0][0] - went_on_s < 0.1
+            assert states[1][0] - went_on_s > 0.1
+        assert 0 < max(late_ns) < LOST_NS
+        states.clear()
+        clock.advance(0.4)  # as long as a triangle may miss its frames
+        await clock.sleep(1.0)
+        assert b"UNKNOWN" not in [state for _, state in states]
+
+
+@stepped
+async def test_what_no_fingertip_felt_before_a_process_stood_still_is_unknown_until_it_is_received(
+    clock: SteppedClock, tmp_path: Path
+) -> None:
+    bus, config = Bus(interface="virtual", channel="stepped-p"), ROOT / "config" / "fingertips.toml"
+    async with living(bus, tmp_path, config=config, scene=Scene(quiet=True), clock=clock) as live:
+        publisher = live.daemon.publisher
+        await live.wait(lambda: {*publisher._states_of_contact.values()} == {"OFF"})
+        clock.advance(3.0)
+        await clock.sleep(0.05)
+        assert {*publisher._states_of_contact.values()} == {"UNKNOWN"}
+        await clock.sleep(1.0)
+        assert {*publisher._states_of_contact.values()} == {"OFF"}
 
 
 @stepped

@@ -315,6 +315,29 @@ async def test_a_worker_that_does_not_end_in_time_is_named_and_killed(
     ]
 
 
+async def test_workers_that_all_hang_are_killed_after_one_request_to_end(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Nobody sends a second one where no service runs them."""
+
+    class Hangs(Ends):
+        def send_signal(self, number: int) -> None:
+            self.signals.append(number)
+            if number == signal.SIGKILL:
+                self._ended.set()
+
+    fakes = Started(monkeypatch, Hangs)
+    monkeypatch.setattr(workers, "STOP_S", 0.05)
+    running = await fakes.two()
+    fakes.on_signal[signal.SIGTERM]()
+    assert await asyncio.wait_for(running, PATIENCE_S) == 1
+    wanted = [signal.SIGTERM, signal.SIGKILL]
+    assert [daemon.signals for daemon in fakes.daemons] == [wanted] * 2
+    assert [one.getMessage() for one in caplog.records] == [
+        "main-1, main-2: not ended within 0.05 s; killed"
+    ]
+
+
 async def test_a_worker_that_is_killed_is_named(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -12,7 +12,7 @@ from emulator.chips.cuse import Caller, I2cDevice, Ioctl
 from emulator.faults import KINDS, parse
 from emulator.probes.scene import Fault, Scene
 from emulator.robot import Robot
-from skin_host.bus.commands import Discover, command_frame
+from skin_host.bus.commands import Discover, SetTxMode, TxMode, command_frame
 from skin_host.bus.wire import FrameBatch
 from skin_host.config import settings as configurations
 from skin_host.errors import ConfigurationError
@@ -264,6 +264,18 @@ def test_a_babbling_node_delays_and_drops_what_the_boards_send(robot: Robot) -> 
     assert np.count_nonzero(babble) > 7000
     assert np.count_nonzero(~babble) < 20 * 2 * 33 / 2
     assert robot.wires["can0"].lost > 0
+
+
+@pytest.mark.parametrize(("share", "obeyed"), [(0.97, True), (1.0, False)])
+def test_no_command_passes_a_bus_that_a_node_fills(
+    robot: Robot, share: float, obeyed: bool
+) -> None:
+    mend = robot.inject(Fault(name="babbling_node", bus="can0", value=share))
+    frames(robot, 0.1)
+    robot.receive("can0", *command_frame(SetTxMode(TxMode.STOP), 14))
+    mend()
+    frames(robot, 0.1)
+    assert (14 in frames(robot, 0.2).id >> 4 & 0xF) == (not obeyed)
 
 
 def test_a_temperature_step_moves_the_bytes_that_are_not_compensated(robot: Robot) -> None:

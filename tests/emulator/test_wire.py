@@ -57,6 +57,41 @@ def test_a_node_that_leaves_no_gap_keeps_all_others_from_the_bus() -> None:
     assert np.count_nonzero(wire.until(110 * MS).id) == 40
 
 
+def test_an_answer_does_not_overflow_the_stack_of_its_board() -> None:
+    """The main loop of an MTB3 answers after it has handed its burst over, when there is room."""
+    wire = wire_of()
+    wire.put(burst(1, 32, 0))
+    assert len(wire.until(MS)) == 8
+    wire.put(FrameBatch.of([(0x210, b"\x1c" + bytes(7), MS)]))
+    sent = wire.until(10 * MS)
+    assert len(sent) == 24 + 1
+    assert wire.lost == 0
+
+
+@pytest.mark.parametrize(("n", "kept"), [(4, 8), (16, 20), (17, 18)])
+def test_a_stack_overflows_only_beyond_its_size(n: int, kept: int) -> None:
+    """Four frames still wait for the bus when a board with a stack of 20 has the next burst."""
+    wire = wire_of()
+    wire.put(burst(0, 30, 0))
+    wire.put(burst(1, 4, 0))
+    assert not (wire.until(2 * MS).id >> 4 & 0xF).any()
+    wire.put(burst(1, n, 2 * MS))
+    own = [can_id for can_id in wire.until(20 * MS).id.tolist() if can_id >> 4 & 0xF == 1]
+    assert len(own) == kept  # with the notice of the overflow
+    assert (0x715 in own) == (wire.lost == 4) == (n == 17)
+
+
+def test_a_wrong_bit_is_one_that_its_frame_has() -> None:
+    """Frames of force/torque boards have six bytes, a notice of an MTB3 none."""
+    wire = wire_of()
+    wire.error_share = 1.0
+    frames = [(0x32A, bytes(6), i * MS) for i in range(200)]
+    wire.put(FrameBatch.of([*frames, (0x715, b"", 200 * MS)]))
+    sent = wire.until(300 * MS)
+    assert (np.unpackbits(sent.data, axis=1).sum(axis=1) == (sent.dlc > 0)).all()
+    assert not sent.data[:, 6:].any()
+
+
 @pytest.mark.parametrize("bitrate", [125_000, 500_000, 1_000_000])
 def test_how_often_one_looks_changes_no_frame(bitrate: int) -> None:
     """Also where boards send more than the bus can carry."""

@@ -189,6 +189,33 @@ async def never(name: str, payload: bytes) -> Mapping[str, Any]:
     raise AssertionError("the handler is not to be asked")
 
 
+@stepped
+async def test_a_request_that_is_delivered_twice_is_carried_out_and_answered_once(
+    clock: SteppedClock,
+) -> None:
+    """A refusal of the second one would be taken for the answer."""
+    begun: list[bytes] = []
+
+    async def handle(name: str, payload: bytes) -> Mapping[str, Any]:
+        begun.append(payload)
+        if len(begun) > 1:
+            raise StateError("it is being done already")
+        await clock.sleep(1.0)
+        return {}
+
+    handler, answers = CommandHandler(handle), list[bytes]()
+    for _ in range(2):
+        handler.take("calibrate", b'{"id":"me-1"}', answers.append)
+        await clock.sleep(0.1)
+    await clock.sleep(2.0)
+    (answer,) = map(decode_result, answers)
+    assert (answer.ok, answer.id) == (True, "me-1")
+    assert (len(begun), handler.taken, handler.refused) == (1, 1, 1)
+    handler.take("calibrate", b'{"id":"me-2"}', answers.append)
+    await clock.sleep(0.1)
+    assert decode_result(answers[1]).cause == "state"
+
+
 def test_each_retained_request_is_named_with_what_clears_it_but_not_a_flood_of_them(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

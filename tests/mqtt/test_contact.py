@@ -63,6 +63,16 @@ def test_a_part_that_feels_is_on_or_off() -> None:
     assert contact.step(frame(2), [begin([3]).ended(2, 2)]) == "OFF"
 
 
+def test_a_part_that_was_not_read_for_a_while_must_be_felt_again_and_a_touch_of_it_lasts() -> None:
+    contact = watched()
+    assert contact.step(frame(1), []) == "OFF"
+    assert contact.unread() == "UNKNOWN"
+    states = [contact.step(frame(50 * MS * sweep), []) for sweep in range(1, 6)]
+    assert (states[0], states[-1]) == ("UNKNOWN", "OFF")
+    assert contact.step(frame(300 * MS, [3]), [begin([3])]) == "ON"
+    assert contact.unread() == "ON"
+
+
 @pytest.mark.parametrize("refused_first", [False, True])
 def test_a_taxel_that_a_calibration_refuses_keeps_no_contact_unknown(refused_first: bool) -> None:
     """It will not be valid again, so nothing can confirm there that the contact is over."""

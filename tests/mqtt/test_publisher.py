@@ -168,6 +168,28 @@ async def test_frames_tell_their_run_also_when_it_changes_within_a_connection(
     assert runs[0] < 2_000_000_000_000_000_000 < runs[1]
 
 
+async def test_touches_that_waited_belong_to_the_newest_run_after_a_start_with_a_clock_set_back(
+    mosquitto: Mosquitto,
+) -> None:
+    """A subscriber that follows the run before would pass over those of an earlier number."""
+    earlier = 2_000_000_000_000_000_000
+    async with Publisher(settings(mosquitto), "robot") as publisher:
+        publisher._numbers.overtake(Stamp(earlier, 0))
+        await until(lambda: publisher.counters.connected)
+    async with listening(mosquitto, "skin/+/palm/touch") as seen:
+        async with Publisher(settings(mosquitto), "robot") as publisher:
+            for number in range(1, 31):
+                publisher.put_touch(touch(number))
+            await until(lambda: publisher.counters.connections == 2)
+            await until(lambda: publisher.counters.touches_sent == 30)
+            await until(lambda: seen.touches()[-1:] == [30])
+    runs = [int(dict(message.properties.UserProperty)["run"]) for message in seen.messages]
+    newest = [json.decode(message.payload)["count"] for message in seen.messages[-30:]]
+    assert newest == [*range(1, 31)]
+    assert len({*runs[-30:]}) == 1
+    assert runs[-1] > earlier > max(runs[:-30], default=0)
+
+
 async def test_frames_and_touches_are_not_retained_the_rest_is(mosquitto: Mosquitto) -> None:
     async with Publisher(settings(mosquitto), "robot") as publisher:
         await until(lambda: publisher.counters.connected)
@@ -505,6 +527,8 @@ async def test_a_command_without_a_fit_reply_topic_is_answered_beside_it(
         ("scan", b"[" * 10_000, "the request is not a JSON object"),
         ("scan", b" " * 70_000, "the request has 70000 bytes"),
         ("Scan it", b"{}", "a command's name"),
+        # With it the topic is as long as one may be.
+        pytest.param("a" * 65_509, b"{}", "a command's name", id="longest"),
     ],
 )
 async def test_a_refused_command_says_why(

@@ -14,6 +14,7 @@ from skin_host.mqtt.info import encode_info, node_info
 from skin_host.mqtt.messages import encode_event
 from skin_host.recording import plots
 from skin_host.recording.export import Series, read_messages
+from skin_host.recording.export.known import Known
 from skin_host.recording.export.scene import Arrows, Points, RecordedScene
 from skin_host.recording.mcap import Recorder
 from tests.support.said import make_event, make_frame
@@ -74,6 +75,19 @@ def at_the_end(series: Series) -> tuple[list[int], bool]:
 
 def states(series: Series) -> list[tuple[str, float]]:
     return [(one.state, (one.t_ns - START_NS) / S) for one in series.contacts]
+
+
+def test_a_frame_after_a_silence_makes_no_untouched_state_of_before_known_again() -> None:
+    """A node sends it before the state that changes with it."""
+    known = Known(3.0)
+    known.status("main", b"online", 0)
+    known.info("main", [PART], 0)
+    known.state(PART, "OFF", 0, stored=False)
+    known.frame(PART, 5 * S, 5 * S)
+    assert [line.state for line in known.contacts] == ["OFF", "UNKNOWN"]
+    known.state(PART, "ON", 5 * S + 1, stored=False)
+    known.health(PART, 6 * S)
+    assert [line.state for line in known.contacts] == ["OFF", "UNKNOWN", "ON"]
 
 
 @pytest.mark.parametrize("ahead_s", [0.0, 3600.0, -3600.0])

@@ -79,12 +79,20 @@ class Known:
         self._presence.take_touch(touch, t_ns * 1e-9)
         self._look(t_ns)
 
-    def sign(self, part: str, t_ns: int, sent_ns: int | None = None) -> None:
-        """Take any other message of a part, which may have a time of its own."""
+    def frame(self, part: str, t_ns: int, sent_ns: int) -> None:
+        """Take a frame of a part, which has a time of its own."""
         self._look_if_late(t_ns)
-        if sent_ns is not None:
-            self._sent_ns[part] = sent_ns, t_ns
+        self._sent_ns[part] = sent_ns, t_ns
+        self._presence.take_data(part, t_ns * 1e-9)
+        self._look_if_gone(part, t_ns)
+
+    def health(self, part: str, t_ns: int) -> None:
+        """Take a health record of a part."""
+        self._look_if_late(t_ns)
         self._presence.take_sign(part, t_ns * 1e-9)
+        self._look_if_gone(part, t_ns)
+
+    def _look_if_gone(self, part: str, t_ns: int) -> None:
         if self._parts.get(part) is False:  # it may be known again
             self._look(t_ns)
 

@@ -192,7 +192,7 @@ def read_messages(recording: Path) -> Series:
                         f"{len(frame.valid)} taxels; export the recordings of one skin"
                     )
                 growing.add(frame)
-                received.append(methodcaller("sign", name, said.t_ns, frame.t_ns))
+                received.append(methodcaller("frame", name, said.t_ns, frame.t_ns))
             elif kind in EVENT_DECODERS:
                 event = EVENT_DECODERS[kind](said.payload)
                 if not repeats.has(event):
@@ -205,7 +205,7 @@ def read_messages(recording: Path) -> Series:
             elif kind == "status":
                 received.append(methodcaller("status", name, said.payload, said.t_ns))
             elif kind == "health" and said.payload and not said.stored:
-                received.append(methodcaller("sign", name, said.t_ns))
+                received.append(methodcaller("health", name, said.t_ns))
                 line = health_line(name, said.t_ns, decode_health(said.payload))
                 if name not in health or health[name]._replace(t_ns=said.t_ns) != line:
                     health[name] = line

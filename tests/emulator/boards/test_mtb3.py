@@ -40,7 +40,7 @@ def started(triangles: int = 1) -> BoardOnBench:
     bench = booted()
     bench.say(SetBoardConfig(2, 50, 240))
     bench.say(SetTriangleConfig(0, triangles - 1))
-    bench.run(0.2)
+    bench.run(0.21)  # into the pause between two bursts
     return bench
 
 
@@ -158,6 +158,22 @@ def test_commands_sent_during_a_calibration_run_in_reverse() -> None:
     assert not bench.board.triangles.any()
 
 
+def test_commands_sent_while_it_reads_and_sends_a_burst_run_in_reverse() -> None:
+    """CI3 CAN1_handleRx(): called once in a turn of the loop, after the burst."""
+    bench = started()
+    while not bench.run(0.001):
+        pass
+    bench.say(SetBoardConfig(2, 50, 200))
+    assert bench.say(GetFirmwareVersion(1, 0)) == []
+    bench.say(SetTriangleConfig(0, 3))
+    assert bench.board.no_load == 240
+    # 3.4 ms for the chips and 0.1 ms for each of two frames.
+    (answer, _), *_ = bench.run(0.004)
+    assert answer == 0x210
+    assert bench.board.no_load == 200
+    assert not bench.board.triangles.any()
+
+
 def test_only_four_commands_wait_and_the_last_one_is_replaced() -> None:
     """CI3 CAN1_interruptRx(): the index stops at 4 and the newest overwrites."""
     bench = booted()
@@ -185,7 +201,7 @@ def test_reset_is_acknowledged_and_executed_only_if_addressed() -> None:
     bench = started()
     bench.board.handle(0x70F, b"\x00", bench.t_ns)
     bench.say(START)
-    assert len(bench.run(0.2)) >= 6
+    assert len(bench.run(0.21)) >= 6
     assert bench.say(EnterBootloader()) == [ResetAnswer(1)]
     bench.run(2.0)
     assert bench.board.no_load == 245
