@@ -128,8 +128,8 @@ class _BoardState:
         usual: that of the last sweep of which no half was missing; 0 while there is none.
         lasted_ns: how long the last such sweep lasted whose frames were not taken together.
         amid: whether the sweep began with another half than the usual one.
-        is_rest: whether it may be the end of the sweep before, of which nothing came that is sent
-            later than the half with which it began.
+        is_rest: whether it may be the end of the sweep before: what came of that is sent before the
+            half with which it began.
     """
 
     index: int

@@ -26,6 +26,8 @@ _PAD_AT = 5
 #: is learnt again, after a pause of so many sweeps.
 _MOST_STRAY_SWEEPS = 4
 _LEARN_AFTER_SWEEPS = 64
+#: In masks of halves.
+_A_HALVES = (1 << TRIANGLES) - 1
 
 
 class Order(NamedTuple):
@@ -56,6 +58,12 @@ class Order(NamedTuple):
     no_status: bytes
     triangles: NDArray[np.intp] | None
     gathers: dict[tuple[int, int], NDArray[np.intp]]
+
+    @property
+    def rises(self) -> bool:
+        """Whether it is that of the places, wherever it begins."""
+        places = self.places
+        return sum(a > b for a, b in zip(places, [*places[1:], places[0]], strict=True)) == 1
 
     @classmethod
     def of(cls, came: Sequence[tuple[bytes, int, int]]) -> "Order":
@@ -162,23 +170,34 @@ class BoardOrder:
         return self.known
 
     def ends(self, bit: int, sent: int) -> bool:
-        """Return whether a half, in the order that was learnt last, comes after all of some others.
+        """Return whether a half is one of the end of a sweep of which some others came.
+
+        That can be known of boards that send triangle after triangle in rising order. Any other
+        order may have been learnt from the end of one sweep and the beginning of the next, which
+        show nothing of where it begins.
 
         Args:
             bit: of the half.
             sent: mask of the others.
         """
-        if self.learnt is None:
+        if self.learnt is None or not self.learnt.rises:
             return False
-        # As many were missing when it was the next.
-        missing = min(missing for missing in self.learnt.missing if missing & bit)
-        return not sent & missing
+        return _place(bit) > max(_place(sent & _A_HALVES), _place(sent & ~_A_HALVES))
 
     def note_stray(self) -> None:
         """Note that a sweep did not come in the known order; too many in succession end that."""
         self.stray += 1
         if self.stray == _MOST_STRAY_SWEEPS:
             self.known, self.stray, self.learn_after = None, 0, _LEARN_AFTER_SWEEPS
+
+
+def _place(halves: int) -> int:
+    """Return the place among a board's values of the last of some A halves, or B halves; -1 without
+    any.
+    """
+    if halves <= _A_HALVES:
+        return 2 * halves.bit_length() - 2 if halves else -1
+    return 2 * (halves.bit_length() - TRIANGLES) - 1
 
 
 def _spread(array: NDArray[_T], triangles: NDArray[np.intp]) -> NDArray[_T]:

@@ -173,6 +173,26 @@ def test_the_rest_of_a_sweep_that_a_full_bus_held_up_joins_no_sweep_that_follows
     assert used >= 2 * (cut // 2) * 55
 
 
+@pytest.mark.parametrize("order", [list(range(8)), [7, 6, 5, 4, 3, 2, 1, 0]])
+@pytest.mark.parametrize("cut", [1, 3, 4, 7])
+def test_sweeps_are_whole_on_a_free_bus_whatever_was_taken_for_their_first_frame(
+    order: list[int], cut: int
+) -> None:
+    """A full bus divided each from the first one on: one began with the rest of that before."""
+    assembler = make()
+    sweeps = []
+    for number in range(1, 40):
+        swept = frames(values(4, number), number * PERIOD)
+        times = [t_ns for _, _, t_ns in swept]
+        if number < 20:
+            times[cut:] = [(number + 1) * PERIOD - 116_000 * (8 - i) for i in range(cut, 8)]
+        sent = [(*swept[i][:2], t_ns) for i, t_ns in zip(order, times, strict=True)]
+        sweeps = feed(assembler, sent if number > 1 else sent[cut:])
+    (sweep,) = sweeps
+    assert sweep.present == 0b1111
+    np.testing.assert_array_equal(sweep.raw[:4], values(4, 39))
+
+
 @pytest.mark.parametrize("triangles", [1, 2])
 def test_a_board_that_changes_its_order_loses_nothing_however_slowly_it_sends(
     triangles: int,
