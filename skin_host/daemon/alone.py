@@ -33,7 +33,9 @@ def alone(settings: Settings, node: str) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+            # Without waiting, should a pipe be in its place.
+            how = os.O_RDONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+            descriptor = os.open(path, how, 0o644)
             stack.callback(os.close, descriptor)
             with contextlib.suppress(OSError):  # another user's, or a disk that is read-only by now
                 # Whoever may enter the folder must be able to open it, to be refused.

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import select
 import signal
 import stat
 import subprocess
@@ -50,6 +51,21 @@ def test_a_second_one_is_refused_until_the_first_has_ended(settings: Settings) -
             pass
     with alone(settings, "main"):
         pass
+
+
+def test_a_pipe_in_place_of_the_lock_holds_up_no_daemon(config: Path, settings: Settings) -> None:
+    """Nobody writes to it: who opened it to read would wait for ever."""
+    with alone(settings, "main"):
+        pass
+    (lock,) = (config.parent / "state").glob("*.lock")
+    lock.unlink()
+    os.mkfifo(lock)
+    command = [sys.executable, "-c", HOLD, str(config)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        ready, _, _ = select.select([process.stdout], [], [], 20.0)
+        process.kill()
+    assert ready
 
 
 def test_another_user_is_refused_too(settings: Settings, tmp_path: Path) -> None:
