@@ -98,13 +98,17 @@ class Sent:
     close together in time belong to one sweep. Every byte of a triangle that is reported as valid
     must come from one such pair, of a chip that answered.
 
+    Args:
+        stacks: addresses of boards that send the second frame first (MTB3).
+
     Attributes:
         bursts: by address, how many sweeps began.
         begun_ns: by address, when the last ones began.
         crowded_ns: when two sweeps of a board last passed close together.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stacks: frozenset[int] = frozenset()) -> None:
+        self._stacks = stacks
         self.crowded_ns = -(1 << 62)
         self._half: dict[int, tuple[int, bytes, int]] = {}
         #: By address and triangle: (12 bytes, status, time in ns).
@@ -224,7 +228,9 @@ class Sent:
             apart_ns = t_ns - half[2]
             if (half[0], header) == (HEADER_A, HEADER_B) and apart_ns <= PAUSE_NS:
                 first, second = half[1], payload
-            elif (half[0], header) == (HEADER_B, HEADER_A) and apart_ns <= PAIR_NS:
+            elif (half[0], header) == (HEADER_B, HEADER_A) and (
+                apart_ns <= PAIR_NS or (address in self._stacks and apart_ns <= PAUSE_NS)
+            ):
                 first, second = payload, half[1]
                 self.crowded_ns = t_ns
             else:
@@ -305,6 +311,8 @@ class Cable:
         command: gives a frame of the host to the robot.
         passes, loses: whether the bus itself passes frames now, and whether it loses some.
         rng: draws what happens to frames.
+        trace: of what the daemon reads and sends.
+        stacks: see `Sent`.
 
     Attributes:
         mischief: what happens to frames.
@@ -328,12 +336,13 @@ class Cable:
         loses: Callable[[], bool],
         rng: np.random.Generator,
         trace: Trace,
+        stacks: frozenset[int] = frozenset(),
     ) -> None:
         self.name = name
         self.mischief = Mischief()
         self.state = LinkState.UP
         self.fate = Fate()
-        self.sent = Sent()
+        self.sent = Sent(stacks)
         self.damaged_ns = self.blurred_ns = -(1 << 62)
         self.move = move
         self._clock = clock

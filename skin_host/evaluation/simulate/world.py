@@ -133,6 +133,11 @@ class World:
                 lambda wire=wire: wire.loss_share > 0.0,  # type: ignore[misc]
                 np.random.default_rng([seed, 20, number]),
                 self.trace,
+                frozenset(
+                    board.address
+                    for board in settings.boards.values()
+                    if board.bus == name and board.model == "mtb3"
+                ),
             )
             for number, (name, wire) in enumerate(self.robot.wires.items())
         }

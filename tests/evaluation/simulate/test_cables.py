@@ -100,3 +100,17 @@ def test_sweeps_that_a_full_bus_passes_close_together_are_known(
         times_ns = (1000 + k * apart_ms) * MS + 120_000 * np.arange(len(ids))
         sent.note(FrameBatch(ids, np.full(len(ids), 8, np.uint8), data, times_ns))
     assert (sent.crowded_ns > 0) is crowded
+
+
+@pytest.mark.parametrize("is_stack", [True, False])
+def test_a_pair_that_a_full_bus_held_up_is_of_one_sweep_where_its_second_frame_is_sent_first(
+    is_stack: bool,
+) -> None:
+    """`kaspar.toml`, seed 4: any other board sends that frame first only of the next sweep."""
+    sent = Sent(frozenset({1} if is_stack else ()))
+    ids, data = encode_sweep(
+        1, np.array([4]), np.full((1, 12), 7, np.uint8), np.zeros(1, np.uint16)
+    )
+    times_ns = np.array([0, 18 * MS])
+    sent.note(FrameBatch(ids, np.full(2, 8, np.uint8), data[::-1].copy(), times_ns))
+    assert bool(list(sent.find(1, 4, bytes([7] * 12)))) is is_stack
