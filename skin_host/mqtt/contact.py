@@ -141,7 +141,7 @@ class PartContact:
         """What was felt for a while has not been read: what was untouched before may be touched."""
         self._unsure[:] = self._triangle_decides
         self._is_unsure = True
-        return "ON" if self._present or any_of(self._touched) else "UNKNOWN"
+        return "ON" if self._present else "UNKNOWN"
 
     def stop(self, events: Iterable[Touch]) -> ContactState:
         """End the contacts, because no data of the part will come for a while."""

@@ -73,6 +73,15 @@ def test_a_part_that_was_not_read_for_a_while_must_be_felt_again_and_a_touch_of_
     assert contact.unread() == "ON"
 
 
+def test_what_touched_a_part_before_it_was_disabled_does_not_touch_it_when_it_is_not_read() -> None:
+    """Its contacts have ended; `icub_hand.toml`, seed 9257: enabled in a stall, it was ON."""
+    contact = watched()
+    touch = begin([3])
+    assert contact.step(frame(1, [3]), [touch]) == "ON"
+    assert contact.stop([touch.ended(2, 2)]) == "UNKNOWN"
+    assert contact.unread() == "UNKNOWN"
+
+
 @pytest.mark.parametrize("refused_first", [False, True])
 def test_a_taxel_that_a_calibration_refuses_keeps_no_contact_unknown(refused_first: bool) -> None:
     """It will not be valid again, so nothing can confirm there that the contact is over."""
