@@ -1427,6 +1427,14 @@ def test_noise_must_be_named_where_a_pad_had_much_less_when_it_was_calibrated(
     assert bool(trouble.must) == must
 
 
+def test_noise_need_not_be_named_of_a_pad_of_real_skin_that_is_stuck_from_the_first(
+    world: World,
+) -> None:
+    """`gripper.toml`, seed 9368: it has none."""
+    world.robot.skin.held_ff[:] = 100.0
+    assert not drawn("noisy_taxel", world, 1.0).must
+
+
 @pytest.mark.parametrize(
     ("own_units", "calibrated_units", "at_once"),
     [(0.5, 0.6, True), (0.5, 0.38, False), (0.25, 0.6, False), (0.25, 0.38, False)],

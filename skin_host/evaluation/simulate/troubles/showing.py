@@ -45,12 +45,14 @@ def _taxel_of(world: World, board: str, triangle: int, pad: int) -> int:
 
 def noise_that_shows(world: World, board: str, triangle: int, pad: int) -> float:
     """Return from how much noise on (rms in units of 2.88 fF) a pad is noisier than it was
-    calibrated: on real skin some are calibrated with six units.
+    calibrated: on real skin some are calibrated with six units, and some are stuck from the first.
     """
+    taxel = _taxel_of(world, board, triangle, pad)
+    if not math.isnan(world.robot.skin.held_ff[taxel]):
+        return math.inf
     calibration = None if world.life is None else world.life.daemon.engine.calibration
     if calibration is None:
         return SURE_NOISE_UNITS
-    taxel = _taxel_of(world, board, triangle, pad)
     if not calibration.usable[taxel]:
         return math.inf
     return max(SURE_NOISE_UNITS, SURE_NOISE * float(calibration.noise[taxel]))
