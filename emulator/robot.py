@@ -292,7 +292,7 @@ class Robot:
 
     def receive(self, bus: str, can_id: int, data: bytes) -> None:
         """A frame from the host; the boards' answers come with the next step."""
-        if self.wires[bus].off or self.wires[bus].full:
+        if not self.wires[bus].passes:
             return
         for number, board in enumerate(self._boards):
             if self._bus_of[number] == bus and number not in self.hung:

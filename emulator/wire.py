@@ -9,6 +9,7 @@ always finds room.
 from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ NEVER_NS = 1 << 62
 NOTHING = FrameBatch.of([])
 
 Ints = NDArray[np.int64]
+_Length = TypeVar("_Length", int, Ints)
 
 
 class Wire:
@@ -92,13 +94,13 @@ class Wire:
         self._ready_ns = ready_ns if alone else None
 
     @property
-    def full(self) -> bool:
-        """Whether a babbling node leaves no gap: nothing of others passes."""
-        return 0 < self._babble_every_ns <= self._babble_frame_ns
+    def passes(self) -> bool:
+        """Whether anything passes besides the frames of a babbling node, which may leave no gap."""
+        return not (self.off or 0 < self._babble_every_ns <= self._babble_frame_ns)
 
     @property
     def _babble_frame_ns(self) -> float:
-        return (OVERHEAD_BITS + STUFF_BITS + 64) * self._bit_ns
+        return _bits(8) * self._bit_ns
 
     @property
     def silent(self) -> bool:
@@ -176,7 +178,7 @@ class Wire:
                 return False
             if ready_ns > t_ns:
                 break
-            free_ns = ready_ns + round((OVERHEAD_BITS + STUFF_BITS + 8 * length) * self._bit_ns)
+            free_ns = ready_ns + round(_bits(length) * self._bit_ns)
             ends_ns.append(free_ns)
         if ends_ns:
             ready, self._waiting = _split(waiting, len(ends_ns))
@@ -236,8 +238,8 @@ class Wire:
             is_sorted = not (priority[1:] < priority[:-1]).any()
             if not is_sorted:
                 group = _rows(group, np.argsort(priority, kind="stable"))
-            bits = OVERHEAD_BITS + STUFF_BITS + 8 * group.dlc.astype(np.int64)
-            passed_ns = np.round(np.cumsum(bits) * self._bit_ns).astype(np.int64)
+            bits = np.cumsum(_bits(group.dlc.astype(np.int64)))
+            passed_ns = np.round(bits * self._bit_ns).astype(np.int64)
             if is_sorted:
                 if len(self._passed) >= _MOST_PASSED:
                     self._passed.clear()
@@ -250,8 +252,8 @@ class Wire:
         n = _ended(under_way, t_ns)
         if n == len(under_way):
             return n
-        bits = OVERHEAD_BITS + STUFF_BITS + 8 * int(under_way.dlc[n])
-        return n + (int(under_way.t_ns[n]) - round(bits * self._bit_ns) < t_ns)
+        takes_ns = round(_bits(int(under_way.dlc[n])) * self._bit_ns)
+        return n + (int(under_way.t_ns[n]) - takes_ns < t_ns)
 
     def _let_first(self, urgent: FrameBatch) -> None:
         """Do what `_arbitrate` does for frames of the highest priority, ready one after the other.
@@ -262,7 +264,7 @@ class Wire:
             return
         under_way = self._under_way
         both = join([under_way, urgent])
-        bits = (OVERHEAD_BITS + STUFF_BITS + 8 * both.dlc.astype(np.int64)).tolist()
+        bits = _bits(both.dlc.astype(np.int64)).tolist()
         is_urgent = (both.id >> 4 == 0).tolist()
         ready_ns = urgent.t_ns.tolist()
         n = self._begun(under_way, ready_ns[0])
@@ -290,6 +292,11 @@ class Wire:
         self._under_way = FrameBatch(
             both.id[rows], both.dlc[rows], both.data[rows], np.array(ends_ns, np.int64)
         )
+
+
+def _bits(length: _Length) -> _Length:
+    """Return how many bits a frame with so many bytes has on the bus."""
+    return OVERHEAD_BITS + STUFF_BITS + 8 * length
 
 
 def _ended(under_way: FrameBatch, t_ns: int) -> int:

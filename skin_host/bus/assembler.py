@@ -22,6 +22,7 @@ from skin_host.bus.classes import BoardClasses, FrameCounters, FrameForms
 from skin_host.bus.order import SHORTEST_RUN, BoardOrder
 from skin_host.bus.periods import SET_BACK_NS, BoardPeriods
 from skin_host.bus.wire import (
+    ALL_TRIANGLES,
     HEAD_BYTES,
     NO_STATUS,
     NS_PER_S,
@@ -42,7 +43,6 @@ _BOTH = 1 << TRIANGLES | 1
 _PAYLOAD = 7
 _NOTHING = bytes(_PAYLOAD)
 _NO_STATUS = bytes(2 * TRIANGLES)
-_ALL_TRIANGLES = (1 << TRIANGLES) - 1
 _NUMBERS = np.arange(TRIANGLES)
 _NEVER_NS = -(1 << 62)
 #: Classes in which boards answer.
@@ -484,7 +484,7 @@ class Assembler:
             self._close_old(first_ns, sweeps)
         self.counters.sweeps += 1
         self.counters.missed += periods.note(last_ns)
-        present, missed = state.awaited & _ALL_TRIANGLES, periods.missed
+        present, missed = state.awaited & ALL_TRIANGLES, periods.missed
         since = state.crowded, state.unread
         sweeps.append(Sweep(state.index, raw, status, present, last_ns, missed, *since))
         state.crowded, state.unread = False, 0

@@ -12,7 +12,14 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.wire import HEAD_BYTES, NO_STATUS, TAXELS, TRIANGLES, VALUES_A
+from skin_host.bus.wire import (
+    ALL_TRIANGLES,
+    HEAD_BYTES,
+    NO_STATUS,
+    TAXELS,
+    TRIANGLES,
+    VALUES_A,
+)
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -26,8 +33,6 @@ _PAD_AT = 5
 #: is learnt again, after a pause of so many sweeps.
 _MOST_STRAY_SWEEPS = 4
 _LEARN_AFTER_SWEEPS = 64
-#: In masks of halves.
-_A_HALVES = (1 << TRIANGLES) - 1
 
 
 class Order(NamedTuple):
@@ -58,12 +63,6 @@ class Order(NamedTuple):
     no_status: bytes
     triangles: NDArray[np.intp] | None
     gathers: dict[tuple[int, int], NDArray[np.intp]]
-
-    @property
-    def rises(self) -> bool:
-        """Whether it is that of the places, wherever it begins."""
-        places = self.places
-        return sum(a > b for a, b in zip(places, [*places[1:], places[0]], strict=True)) == 1
 
     @classmethod
     def of(cls, came: Sequence[tuple[bytes, int, int]]) -> "Order":
@@ -141,13 +140,13 @@ class BoardOrder:
         known: the order, once it is learnt.
         stray: sweeps in succession with frames in another order.
         learn_after: so many sweeps pass before the order is learnt.
-        learnt: the order that was known last.
+        rises: whether the order that was known last is that of the places, wherever it begins.
     """
 
     known: Order | None = None
     stray: int = 0
     learn_after: int = 1
-    learnt: Order | None = None
+    rises: bool = False
 
     def begin_sweep(self) -> bool:
         """Note that a sweep begins while no order is known; return whether it may show it."""
@@ -166,7 +165,10 @@ class BoardOrder:
         if len(came) < SHORTEST_RUN or any(head[_DLC_AT] < 8 for head, _, _ in came):
             self.learn_after = _LEARN_AFTER_SWEEPS
         else:
-            self.known = self.learnt = Order.of(came)
+            self.known = Order.of(came)
+            places = self.known.places
+            falls = [a > b for a, b in zip(places, [*places[1:], places[0]], strict=True)]
+            self.rises = sum(falls) == 1
         return self.known
 
     def ends(self, bit: int, sent: int) -> bool:
@@ -180,9 +182,8 @@ class BoardOrder:
             bit: of the half.
             sent: mask of the others.
         """
-        if self.learnt is None or not self.learnt.rises:
-            return False
-        return _place(bit) > max(_place(sent & _A_HALVES), _place(sent & ~_A_HALVES))
+        last = max(_place(sent & ALL_TRIANGLES), _place(sent & ~ALL_TRIANGLES))
+        return self.rises and _place(bit) > last
 
     def note_stray(self) -> None:
         """Note that a sweep did not come in the known order; too many in succession end that."""
@@ -195,7 +196,7 @@ def _place(halves: int) -> int:
     """Return the place among a board's values of the last of some A halves, or B halves; -1 without
     any.
     """
-    if halves <= _A_HALVES:
+    if halves <= ALL_TRIANGLES:
         return 2 * halves.bit_length() - 2 if halves else -1
     return 2 * (halves.bit_length() - TRIANGLES) - 1
 

@@ -405,9 +405,7 @@ class Daemon:
         for part, contact in self._contacts.items():
             if part not in self.engine.disabled:
                 self.publisher.put_contact(self.layout.parts[part].name, contact.unread())
-        tips = self.engine.fingertips
-        for name, state in ({} if tips is None else tips.tips).items():
-            self.publisher.put_contact(name, "ON" if state.tip.touched else "UNKNOWN")
+        self.fingertips.deliver((), unread=True)
 
     def _end_contacts(self, part: int) -> None:
         events = self.engine.end_part(part, self.clock.now_ns())
@@ -485,12 +483,9 @@ class Daemon:
         service.notify("READY=1")
 
     def _deliver(self, output: Output) -> None:
-        if self.link.is_behind:
-            self._note_unread()
-            for event in output.grasps:
-                self.publisher.put_touch(event)
-        elif self.engine.fingertips is not None:
-            self.fingertips.deliver(output.grasps)
+        behind = self.link.is_behind
+        if self.engine.fingertips is not None:
+            self.fingertips.deliver(output.grasps, unread=behind)
         if output.steps:
             if self._zero_changes != self.engine.zeros.changes:
                 # Something may press a pad whose zero was not found, did before it was held, or
@@ -504,16 +499,17 @@ class Daemon:
                 for event in step.events:
                     self.publisher.put_touch(event)
                 state = self._contacts[step.part].step(step.frame, step.events)
-                if self.link.is_behind:
-                    state = self._contacts[step.part].unread()
-                self.publisher.put_contact(step.frame.part, state)
+                if not behind:
+                    self.publisher.put_contact(step.frame.part, state)
             self.health.note(output)
             for step in output.steps:
                 if step.part not in self.engine.touch_only:
-                    if self.link.is_behind:
+                    if behind:
                         self.publisher.skip_frame()  # its pressures would look like those of now
                     else:
                         self.publisher.put_frame(step.frame)
+        if behind:
+            self._note_unread()
         # Notify systemd's watchdog only here, after work that was done.
         if self._feed_s is not None:
             now_s = self.clock.monotonic_s()

@@ -135,12 +135,13 @@ class FingertipPublisher:
         self._published: dict[str, tuple[object, int]] = {}
         self._put_contacts()
 
-    def deliver(self, events: Iterable[FingertipEvent]) -> None:
+    def deliver(self, events: Iterable[FingertipEvent], *, unread: bool = False) -> None:
+        """Publish events and contacts; what is `unread` may be touched by now."""
         if self._engine is None:
             return
         for event in events:
             self._publisher.put_touch(event)
-        self._put_contacts()
+        self._put_contacts(unread=unread)
 
     def end(self, t_ns: int) -> None:
         """End all contacts, because the daemon stops."""
@@ -149,9 +150,9 @@ class FingertipPublisher:
             for name in self._engine.tips:
                 self._publisher.put_contact(name, "UNKNOWN")
 
-    def _put_contacts(self) -> None:
+    def _put_contacts(self, *, unread: bool = False) -> None:
         for name, state in ({} if self._engine is None else self._engine.tips).items():
-            free: ContactState = "OFF" if state.tip.feels else "UNKNOWN"
+            free: ContactState = "OFF" if state.tip.feels and not unread else "UNKNOWN"
             self._publisher.put_contact(name, "ON" if state.tip.touched else free)
 
     def records(self, now_ns: int) -> dict[str, FingertipRecord]:

@@ -146,8 +146,7 @@ class PartContact:
     def stop(self, events: Iterable[Touch]) -> ContactState:
         """End the contacts, because no data of the part will come for a while."""
         self._present.difference_update(event.id for event in events)
-        self._unsure[:] = self._triangle_decides
-        self._is_unsure = True
+        self.unread()
         return "UNKNOWN"
 
 

@@ -181,6 +181,15 @@ class Ends:
         return self.returncode
 
 
+class Hangs(Ends):
+    """A daemon that ends only when it is killed."""
+
+    def send_signal(self, number: int) -> None:
+        self.signals.append(number)
+        if number == signal.SIGKILL:
+            self._ended.set()
+
+
 class Started:
     """Takes the place of the processes that workers run in, and of the signals to their parent.
 
@@ -298,16 +307,10 @@ async def test_a_stop_before_a_daemon_has_begun_is_a_clean_end(
 async def test_a_worker_that_does_not_end_in_time_is_named_and_killed(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    class Hangs(Ends):
-        def send_signal(self, number: int) -> None:
-            self.signals.append(number)
-            if number == signal.SIGKILL or self is fakes.daemons[0]:
-                self._ended.set()
-
     fakes = Started(monkeypatch, Hangs)
     monkeypatch.setattr(workers, "STOP_S", 0.05)
     running = await fakes.two()
-    fakes.daemons[0].send_signal(signal.SIGTERM)
+    fakes.daemons[0]._ended.set()
     assert await asyncio.wait_for(running, PATIENCE_S) == 1
     assert fakes.daemons[1].signals == [signal.SIGTERM, signal.SIGKILL]
     assert [one.getMessage() for one in caplog.records] == [
@@ -319,13 +322,6 @@ async def test_workers_that_all_hang_are_killed_after_one_request_to_end(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Nobody sends a second one where no service runs them."""
-
-    class Hangs(Ends):
-        def send_signal(self, number: int) -> None:
-            self.signals.append(number)
-            if number == signal.SIGKILL:
-                self._ended.set()
-
     fakes = Started(monkeypatch, Hangs)
     monkeypatch.setattr(workers, "STOP_S", 0.05)
     running = await fakes.two()

@@ -33,6 +33,17 @@ def unread(
     return bench
 
 
+def press(diameter_mm: float, start_s: float) -> Probe:
+    """A probe that presses the finger from then on."""
+    return Probe(
+        part=PART,
+        at=Place(triangle=0),
+        diameter_mm=diameter_mm,
+        force_n=[(0.0, 0.0), (1.0, 2.0), (1000.0, 2.0)],
+        start_s=start_s,
+    )
+
+
 @pytest.mark.parametrize("warmer_c", [-4.0, 1.5, 2.0])
 def test_what_drifted_while_a_chip_was_not_read_is_no_touch(warmer_c: float) -> None:
     """All pads would be touched, and stay it, because a touch hides drift."""
@@ -56,14 +67,7 @@ def test_a_plug_whose_contact_flickers_as_it_comes_back_is_compared_all_the_same
 
 
 def test_what_came_on_some_pads_meanwhile_is_a_touch_of_these() -> None:
-    press = Probe(
-        part=PART,
-        at=Place(triangle=0),
-        diameter_mm=4,
-        force_n=[(0.0, 0.0), (1.0, 2.0), (1000.0, 2.0)],
-        start_s=CALIBRATED_S + UNREAD_S / 2,
-    )
-    bench = unread(1.5, probe=[press])
+    bench = unread(1.5, probe=[press(4, CALIBRATED_S + UNREAD_S / 2)])
     bench.run(2.0)
     pressed = bench.robot.true_pressure_kpa(PART) > 20.0
     assert pressed.any()
@@ -99,14 +103,8 @@ def test_a_calibration_without_a_chip_does_not_show_what_its_pads_drifted_by() -
 
 def test_a_calibration_without_a_chip_does_not_show_that_its_pads_are_released() -> None:
     """A restart of the board would hide the press for as long as it lasts."""
-    press = Probe(
-        part=PART,
-        at=Place(triangle=0),
-        diameter_mm=6,
-        force_n=[(0.0, 0.0), (1.0, 2.0), (1000.0, 2.0)],
-        start_s=CALIBRATED_S,
-    )
-    bench = FaultBench(scene=Scene(quiet=True, probe=[press]), config=GRIPPER)
+    scene = Scene(quiet=True, probe=[press(6, CALIBRATED_S)])
+    bench = FaultBench(scene=scene, config=GRIPPER)
     bench.run(5.0)
     touched = bench.touched[PART]
     assert touched.any()

@@ -129,7 +129,7 @@ class World:
                 self.clock,
                 self.move,
                 self.robot.receive,
-                lambda wire=wire: not (wire.off or wire.full),  # type: ignore[misc]
+                lambda wire=wire: wire.passes,  # type: ignore[misc]
                 lambda wire=wire: wire.loss_share > 0.0,  # type: ignore[misc]
                 np.random.default_rng([seed, 20, number]),
                 self.trace,

@@ -44,20 +44,23 @@ from skin_host.processing.events import Touch
 DEMO = configuration("demo.toml")
 
 
+def world_of(config: Path, seed: int = 1, *, quiet: bool = True) -> World:
+    """The whole system of a configuration; its state directory is the environment's."""
+    settings, layout = load_skin(config)
+    return World(settings, layout, config, seed, Scene(quiet=quiet))
+
+
 @pytest.fixture
 def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    settings, layout = load_skin(DEMO)
-    yield World(settings, layout, DEMO, 1, Scene(quiet=True))
+    yield world_of(DEMO)
 
 
 @pytest.fixture
 def worn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> World:
     """Ten boards on one bus, with noise as on real skin: a start takes seconds to set them up."""
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    kaspar = DEMO.with_name("kaspar.toml")
-    settings, layout = load_skin(kaspar)
-    return World(settings, layout, kaspar, 2, Scene(quiet=False))
+    return world_of(DEMO.with_name("kaspar.toml"), 2, quiet=False)
 
 
 def start(world: World) -> Life:
@@ -710,8 +713,7 @@ def test_a_calibration_of_one_board_keeps_the_zeros_of_the_others(
 ) -> None:
     """Also if the power fails before the calibration has its name, or right after."""
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    settings, layout = load_skin(DEMO)
-    world = World(settings, layout, DEMO, 1, Scene(quiet=False))
+    world = world_of(DEMO, quiet=False)
 
     async def live() -> None:
         life = start(world)
@@ -726,12 +728,12 @@ def test_a_calibration_of_one_board_keeps_the_zeros_of_the_others(
         await life.daemon.calibrate(0.5, [first])
         zeroed = baselines(life)
         life.kill()
-        path = calibration_path(settings, "main")
+        path = calibration_path(world.settings, "main")
         for known in (life.daemon.engine.calibration, calibrated):
             assert known is not None
-            save_calibration(path, known, layout)
-            after = stored_calibration(settings, layout, "main")
-            pipeline = Daemon(settings, layout, calibration=after).engine.pipeline
+            save_calibration(path, known, world.layout)
+            after = stored_calibration(world.settings, world.layout, "main")
+            pipeline = Daemon(world.settings, world.layout, calibration=after).engine.pipeline
             assert pipeline is not None
             assert np.abs(pipeline.baseline - zeroed)[others].max() < 0.5
 
@@ -825,9 +827,7 @@ def test_a_shorted_data_line_that_two_parts_share_is_named_by_both(
 ) -> None:
     """Each has only two of the four triangles that stop answering."""
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    small = Path(__file__).with_name("small.toml")
-    settings, layout = load_skin(small)
-    world = World(settings, layout, small, 1, Scene(quiet=True))
+    world = world_of(Path(__file__).with_name("small.toml"))
 
     async def live() -> None:
         life = start(world)
@@ -902,9 +902,7 @@ def test_what_waited_for_a_full_bus_is_of_before_a_chip_was_gone(
     The computer slept meanwhile, so that its daemon awaits what the boards send next.
     """
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    gripper = DEMO.with_name("gripper.toml")
-    settings, layout = load_skin(gripper)
-    world = World(settings, layout, gripper, 1, Scene(quiet=True))
+    world = world_of(DEMO.with_name("gripper.toml"))
 
     async def live() -> str | None:
         promises, life = start_watched(world)
@@ -1180,9 +1178,7 @@ def test_a_step_of_temperature_must_be_named_where_it_cannot_be_an_even_load(
 ) -> None:
     """`gripper.toml`, seed 21: all pads of two fingertips read as touched with 10 kPa."""
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    config = DEMO.with_name(robot)
-    settings, layout = load_skin(config)
-    world = World(settings, layout, config, 1, Scene(quiet=True))
+    world = world_of(DEMO.with_name(robot))
 
     async def live() -> None:
         life = start(world)
@@ -1256,9 +1252,7 @@ def test_a_chip_whose_set_up_was_damaged_is_not_judged_until_its_board_was_off_a
 @pytest.mark.parametrize("kind", ["bit_errors", "frames_damaged"])
 def test_damage_must_be_named_by_when_enough_of_it_came(world: World, kind: str) -> None:
     """One triangle sends 40 frames a second, 33 of them 1320."""
-    few = DEMO.with_name("fingertips.toml")
-    settings, layout = load_skin(few)
-    one = World(settings, layout, few, 1, Scene(quiet=True))
+    one = world_of(DEMO.with_name("fingertips.toml"))
     for number in range(20):
         chance = random.Random(number)
         trouble = KINDS[kind](one, chance, True)
@@ -1272,9 +1266,7 @@ def test_loss_must_be_named_by_when_a_second_with_enough_of_it_has_come(
     world: World, kind: str
 ) -> None:
     """`gripper.toml`, seed 9350: 1.6 % of 80 frames a second, of which two in one may take long."""
-    few = DEMO.with_name("gripper.toml")
-    settings, layout = load_skin(few)
-    one = World(settings, layout, few, 1, Scene(quiet=True))
+    one = world_of(DEMO.with_name("gripper.toml"))
     draws = np.random.default_rng(1)
     for number in range(20):
         trouble = KINDS[kind](one, random.Random(number), False)
@@ -1290,8 +1282,7 @@ def test_a_fingertip_that_was_free_between_two_samples_need_not_be_touched_at_on
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    config = DEMO.with_name("fingertips.toml")
-    one = World(*load_skin(config), config, 1, Scene(quiet=True))
+    one = world_of(DEMO.with_name("fingertips.toml"))
 
     async def live() -> None:
         life = start(one)
